@@ -1,0 +1,30 @@
+# Six verbs. `make demo` and `make test` set themselves up on a bare machine.
+PY := .venv/bin/python
+
+.PHONY: demo test lint bench hil docs lock
+
+demo: .venv/ready
+	$(PY) -m processing.demo
+
+test: .venv/ready
+	$(PY) -m pytest
+
+lint: .venv/ready
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+	.venv/bin/lint-imports
+
+# Debian leaves venv out of python3; root (a container, CI) can put it there, anyone else is told.
+.venv/ready: pyproject.toml requirements.lock
+	@python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "RTLog needs Python 3.11 or newer"; exit 1; }
+	@python3 -c 'import ensurepip' 2>/dev/null || [ "$$(id -u)" != 0 ] || { apt-get -qq update && apt-get -qq install -y python3-venv; }
+	@python3 -c 'import ensurepip' 2>/dev/null || { echo "python3 lacks venv: apt-get install python3-venv"; exit 1; }
+	python3 -m venv .venv
+	$(PY) -m pip install --quiet --require-hashes -r requirements.lock
+	$(PY) -m pip install --quiet --no-deps -e .
+	touch $@
+
+# Resolve pyproject.toml anew for every Python from 3.11 on.
+lock:
+	uv pip compile --universal --python-version 3.11 --extra dev --generate-hashes -q pyproject.toml -o requirements.lock

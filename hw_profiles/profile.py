@@ -1,0 +1,221 @@
+"""The hardware profile: what the vehicle is, as frozen, strict records.
+
+In: TOML, the vehicle engineer's. Out: a `Profile`. A recording needs `[vehicle]`, `[lasers]`, `[[encoders]]` and
+`[rfid]` only; the device sections (`[lasers.primary.device]`, `[encoder_bus]`, `[rfid.device]`) are what the server
+needs on top, and are checked with the rest. Lengths in metres, angles in degrees, as the unit at the end of a key says.
+
+                        y                    mount: where the scanner sits in the vehicle frame (REP-103), whose
+                        ^                    origin is the middle of the axle that `[vehicle]` describes
+              left wheel|
+       scanner  ●───────┼──────> x  ahead
+              right wheel
+"""
+
+import difflib
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from hw_profiles.errors import BadInputError
+
+SHIPPED = Path(__file__).parent
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A strict record: a key that is not a field of it is an error."""
+
+
+class OdometryNoise(Record, frozen=True):
+    """How the wheels' error grows: standard deviations per square root of distance or angle travelled."""
+
+    distance_m_per_sqrt_m: float = 0.02
+    heading_deg_per_sqrt_m: float = 0.3
+    heading_deg_per_sqrt_deg: float = 0.2
+
+
+class Vehicle(Record, frozen=True):
+    kinematics: Literal["differential", "tricycle"]
+    track_width_m: float | None = None
+    wheelbase_m: float | None = None
+    drive_axle: Literal["rear", "front"] = "rear"  # tricycle: the axle whose wheel the drive encoder counts
+    odometry_noise: OdometryNoise = OdometryNoise()
+
+
+class Mount(Record, frozen=True):
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_deg: float = 0.0
+
+
+class LaserDevice(Record, frozen=True):
+    host: str
+    port: int = 2112
+    scan_frequency_hz: Literal[25, 50] = 50  # the LMS111 pairs 25 Hz with 0.25° and 50 Hz with 0.5°
+
+
+class Laser(Record, frozen=True):
+    model: Literal["LMS111"] = "LMS111"
+    mount: Mount = Mount()
+    device: LaserDevice | None = None
+
+
+class Lasers(Record, frozen=True):
+    primary: Laser = Laser()
+    auxiliary: Laser | None = None
+
+
+class Encoder(Record, frozen=True):
+    name: str
+    role: Literal["left_wheel", "right_wheel", "drive_wheel", "steering"]
+    counts_per_turn: int = 4096
+    wheel_radius_m: float | None = None
+    zero_deg: float = 0.0  # steering: the encoder's reading when the wheel points straight ahead
+    reversed: bool = False  # counts fall when the vehicle drives ahead, or steers to the left
+    address: int | None = None  # on the bus: SEI address 0…14
+
+
+class SeiBus(Record, frozen=True, tag_field="kind", tag="sei"):
+    """US Digital A2 encoders on one SEI bus behind a serial port."""
+
+    port: str
+    baud: Literal[9600, 115200] = 9600
+    echo: Literal["auto", "yes", "no"] = "auto"  # does the adapter return every byte that is sent?
+    turns: Literal["single", "multi"] = "single"
+
+
+class RfidDevice(Record, frozen=True):
+    host: str
+    port: int = 23
+    username: str = "alien"
+    password: str = "password"
+    stream_host: str | None = None  # our own address as the reader sees it; None: the one the console was opened from
+    stream_port: int = 0  # the reader connects back to this port; 0 takes any
+
+
+class Rfid(Record, frozen=True):
+    model: Literal["ALR-9650"] = "ALR-9650"
+    device: RfidDevice | None = None
+
+
+class Zenoh(Record, frozen=True):
+    listen: tuple[str, ...] = ("tcp/0.0.0.0:7447",)
+
+
+class Profile(Record, frozen=True):
+    schema: Literal[1]
+    name: str
+    tick_period_s: float = 0.1
+    vehicle: Vehicle | None = None
+    lasers: Lasers = Lasers()
+    encoders: list[Encoder] = []
+    encoder_bus: SeiBus | None = None
+    rfid: Rfid | None = None
+    zenoh: Zenoh = Zenoh()
+
+    def encoder(self, role: str) -> Encoder:
+        """The encoder in this role; the profile was checked to hold it if its kinematics need it."""
+        return next(encoder for encoder in self.encoders if encoder.role == role)
+
+
+ROLES = {"differential": ("left_wheel", "right_wheel"), "tricycle": ("drive_wheel", "steering")}
+
+
+def shipped_profiles() -> list[str]:
+    """The names of the profiles that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def read_profile_text(name_or_path: str | Path) -> str:
+    """The TOML of a shipped profile by its name, or of a file.
+
+    Raises:
+        BadInputError: there is no such profile or file, or it is no text.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in shipped_profiles():
+        path = SHIPPED / f"{name_or_path}.toml"
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        hint = f"shipped profiles are {', '.join(shipped_profiles())}"
+        raise BadInputError(f"profile {name_or_path}: {error.strerror or error}; {hint}") from error
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"profile {name_or_path}: not UTF-8 text (byte {error.start})") from error
+
+
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Read and check a profile. Raises: BadInputError with the file, the key and what is wrong with it."""
+    return parse_profile(read_profile_text(name_or_path), source=str(name_or_path))
+
+
+def parse_profile(text: str, source: str) -> Profile:
+    """Check a profile's TOML; `source` names it in errors. Raises: BadInputError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadInputError(f"profile {source}: not TOML: {error}") from error
+    for key, known in _unknown_keys(raw, Profile, ""):
+        near = difflib.get_close_matches(key.rsplit(".", 1)[-1], known, n=1, cutoff=0.0)
+        raise BadInputError(f"profile {source}: unknown key {key}; the nearest known one is {near[0]}")
+    try:
+        profile = msgspec.convert(raw, Profile)
+    except msgspec.ValidationError as error:
+        raise BadInputError(f"profile {source}: {str(error).replace(' - at `$.', ' at `')}") from error
+    for problem in _problems(profile):
+        raise BadInputError(f"profile {source}: {problem}")
+    return profile
+
+
+def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str, list[str]]]:
+    """Each key of `raw` that the record `expected` lacks, with its path, and the keys known there."""
+    if isinstance(expected, types.UnionType):
+        expected = typing.get_args(expected)[0]
+    if isinstance(raw, list) and typing.get_origin(expected) is list:
+        for index, item in enumerate(raw):
+            yield from _unknown_keys(item, typing.get_args(expected)[0], f"{where}[{index}]")
+    if not (isinstance(raw, dict) and isinstance(expected, type) and issubclass(expected, msgspec.Struct)):
+        return
+    hints = typing.get_type_hints(expected)
+    known = [name for name in hints if not name.startswith("__")]
+    tag_field = expected.__struct_config__.tag_field
+    for key, value in raw.items():
+        path = f"{where}.{key}".lstrip(".")
+        if key in known:
+            yield from _unknown_keys(value, hints[key], path)
+        elif key != tag_field:
+            yield path, known
+
+
+def _problems(profile: Profile) -> Iterator[str]:
+    """What the types cannot say."""
+    if not 0.01 <= profile.tick_period_s <= 10.0:
+        yield f"tick_period_s is {profile.tick_period_s}; it must lie in 0.01 … 10"
+    vehicle = profile.vehicle
+    if profile.encoders and vehicle is None:
+        yield "[[encoders]] need a [vehicle] with its kinematics"
+    if vehicle is not None:
+        needed = "track_width_m" if vehicle.kinematics == "differential" else "wheelbase_m"
+        size = getattr(vehicle, needed)
+        if size is None or not (size > 0 and math.isfinite(size)):
+            yield f"vehicle.{needed} is {size}; {vehicle.kinematics} kinematics need it above 0"
+        roles = [encoder.role for encoder in profile.encoders]
+        wanted = ROLES[vehicle.kinematics]
+        if roles and sorted(roles) != sorted(wanted):
+            yield f"{vehicle.kinematics} kinematics need one encoder in each role {' and '.join(wanted)}; found {roles}"
+    names = [encoder.name for encoder in profile.encoders]
+    if len(set(names)) != len(names):
+        yield f"encoders share a name: {names}"
+    for index, encoder in enumerate(profile.encoders):
+        where = f"encoders[{index}]"
+        if not 2 <= encoder.counts_per_turn <= 65536 * 65536:
+            yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; it must be 2 or more"
+        if encoder.role != "steering" and not (encoder.wheel_radius_m or 0) > 0:
+            yield f"{where}.wheel_radius_m is {encoder.wheel_radius_m}; a wheel needs it above 0"
+        if profile.encoder_bus is not None and not 0 <= (encoder.address if encoder.address is not None else -1) <= 14:
+            yield f"{where}.address is {encoder.address}; an encoder on an SEI bus has one in 0 … 14"

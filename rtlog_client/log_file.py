@@ -1,0 +1,194 @@
+"""MCAP: write a recording so that nothing is lost, read one, whoever wrote it.
+
+A recording in the making is `NAME.mcap.part`. The metadata and the profile come first in it; `sync` once a second makes
+all that was written so far safe against a power cut; `finish` writes the index and gives the file its name.
+Times are nanoseconds UTC: log_time is the tick's, publish_time the header stamp's (see the contract of recordings).
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from hw_profiles.errors import BadInputError
+from rtlog_server.messages import schema_text
+
+METADATA_NAME = "rtlog"
+PROFILE_NAME = "profile.toml"
+CHUNK_BYTES = 256 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedMessage:
+    topic: str
+    msgtype: str
+    data: bytes  # CDR
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogInfo:
+    run_id: str  # the file's stem where the metadata do not say
+    metadata: dict[str, str]
+    profile_toml: str | None
+    message_counts: dict[str, int]  # per topic
+    start_ns: int
+    end_ns: int
+    msgtypes: dict[str, str] = field(default_factory=dict)  # per topic
+
+
+class LogWriter:
+    """Writes `path`, a `*.mcap` that must not exist yet.
+
+    Raises:
+        BadInputError: the file or its part file exists already, or its folder cannot be written.
+    """
+
+    def __init__(self, path: Path, metadata: dict[str, str], profile_toml: str | None) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        if path.exists():
+            raise BadInputError(f"{path} exists already; it is left as it is")
+        try:
+            self._file: BinaryIO = self.part.open("xb")
+        except FileExistsError as error:
+            hint = f"rtlog-client recover {self.part} mends what a cut-off recording left"
+            raise BadInputError(f"{self.part} exists already; {hint}") from error
+        except OSError as error:
+            raise BadInputError(f"{self.part}: {error.strerror or error}") from error
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="rtlog")
+        if profile_toml is not None:
+            now_ns = 0  # the attachment is part of the recording, not of a moment
+            self._writer.add_attachment(now_ns, now_ns, PROFILE_NAME, "application/toml", profile_toml.encode())
+        self._writer.add_metadata(METADATA_NAME, {"run_id": path.stem, **metadata})
+        self._channels: dict[str, int] = {}
+        self._sequences: dict[str, int] = {}
+        self.sync()
+
+    def write(
+        self,
+        topic: str,
+        msgtype: str,
+        data: bytes,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int | None = None,
+    ) -> None:
+        """Append one message; without a sequence number it gets the next of its topic."""
+        if topic not in self._channels:
+            schema = self._writer.register_schema(msgtype, "ros2msg", schema_text(msgtype).encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        if sequence is None:
+            sequence = self._sequences.get(topic, 0)
+        self._sequences[topic] = sequence + 1
+        self._writer.add_message(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+
+    def sync(self) -> None:
+        """Bring everything written so far to the disk."""
+        self._writer.flush()
+        self._file.flush()
+        os.fdatasync(self._file.fileno())
+
+    @property
+    def size_bytes(self) -> int:
+        return self._file.tell()
+
+    def finish(self) -> None:
+        """Write the index, sync, and give the file its name."""
+        self._writer.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        self.part.rename(self.path)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+
+    def abandon(self) -> None:
+        """Close and remove the part file: for writers whose input turned out to be bad."""
+        self._file.close()
+        self.part.unlink(missing_ok=True)
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, _value: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.abandon()
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise BadInputError(f"{path}: {error.strerror or error}") from error
+    if path.stat().st_size == 0:
+        file.close()
+        raise BadInputError(f"{path}: the file is empty")
+    return file
+
+
+def _wrong(path: Path, error: Exception) -> BadInputError:
+    with path.open("rb") as file:
+        is_mcap = file.read(8) == b"\x89MCAP0\r\n"
+    if not is_mcap:
+        return BadInputError(f"{path}: not an MCAP recording")
+    return BadInputError(f"{path}: cut off or damaged ({type(error).__name__}); rtlog-client recover {path} mends it")
+
+
+def read_info(path: Path) -> LogInfo:
+    """What the recording says about itself. Raises: BadInputError: missing, empty, no MCAP, or cut off."""
+    with _open(path) as file:
+        try:
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            records = {record.name: record.metadata for record in reader.iter_metadata()}
+            profile = next((a.data.decode() for a in reader.iter_attachments() if a.name == PROFILE_NAME), None)
+        except (McapError, ValueError, EOFError, OSError) as error:
+            raise _wrong(path, error) from error
+    if summary is None or summary.statistics is None:
+        raise BadInputError(f"{path}: the recording has no index; rtlog-client recover {path} makes one")
+    statistics, metadata = summary.statistics, records.get(METADATA_NAME, {})
+    topics = {channel.id: channel.topic for channel in summary.channels.values()}
+    counts = {topics[key]: count for key, count in statistics.channel_message_counts.items()}
+    msgtypes = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
+    return LogInfo(
+        run_id=metadata.get("run_id", path.stem),
+        metadata=metadata,
+        profile_toml=profile,
+        message_counts=counts,
+        start_ns=statistics.message_start_time,
+        end_ns=statistics.message_end_time,
+        msgtypes=msgtypes,
+    )
+
+
+def read_messages(path: Path, topics: list[str] | None = None) -> Iterator[LoggedMessage]:
+    """The messages in order of log_time; `topics` None: all. Raises: BadInputError as `read_info`, also midway."""
+    with _open(path) as file:
+        try:
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics=topics):
+                yield LoggedMessage(
+                    channel.topic,
+                    schema.name if schema else "",
+                    message.data,
+                    message.log_time,
+                    message.publish_time,
+                    message.sequence,
+                )
+        except (McapError, ValueError, EOFError) as error:
+            raise _wrong(path, error) from error
