@@ -1,7 +1,7 @@
 """SE(2): wrap_angle, composition, relative pose, Jacobians. The only ones.
 
-A pose is an array (..., 3) of x [m], y [m], heading θ [rad], REP-103: x ahead, y left, θ counter-clockwise. All functions
-broadcast over the leading axes.
+A pose is an array (..., 3) of x [m], y [m], heading θ [rad], REP-103: x ahead, y left, θ counter-clockwise. All
+functions broadcast over the leading axes.
 """
 
 import numpy as np
