@@ -74,6 +74,7 @@ class Device(ABC, Generic[SampleT]):
         self.connected = False
         self.connects = 0
         self.identity: dict[str, str] = {}  # serial number, firmware …, filled by connect()
+        self.diagnostics: dict[str, str] = {}  # what the device says of its own health: temperature, contamination …
         self._stale_after_ns = int(stale_after_s * 1e9)
         self._inbox: deque[SampleT] = deque(maxlen=INBOX_SAMPLES)
         self._measured_ns: int | None = None
