@@ -11,24 +11,17 @@ needs on top, and are checked with the rest. Lengths in metres, angles in degree
               right wheel
 """
 
-import difflib
 import math
-import tomllib
-import types
-import typing
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import msgspec
+from msgspec import field
 
 from hw_profiles.errors import BadInputError
+from hw_profiles.strict_toml import Record, parse_toml
 
 SHIPPED = Path(__file__).parent
-
-
-class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A strict record: a key that is not a field of it is an error."""
 
 
 class OdometryNoise(Record, frozen=True):
@@ -113,7 +106,7 @@ class Profile(Record, frozen=True):
     tick_period_s: float = 0.1
     vehicle: Vehicle | None = None
     lasers: Lasers = Lasers()
-    encoders: list[Encoder] = []
+    encoders: list[Encoder] = field(default_factory=list)
     encoder_bus: SeiBus | None = None
     rfid: Rfid | None = None
     zenoh: Zenoh = Zenoh()
@@ -156,40 +149,10 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 def parse_profile(text: str, source: str) -> Profile:
     """Check a profile's TOML; `source` names it in errors. Raises: BadInputError."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadInputError(f"profile {source}: not TOML: {error}") from error
-    for key, known in _unknown_keys(raw, Profile, ""):
-        near = difflib.get_close_matches(key.rsplit(".", 1)[-1], known, n=1, cutoff=0.0)
-        raise BadInputError(f"profile {source}: unknown key {key}; the nearest known one is {near[0]}")
-    try:
-        profile = msgspec.convert(raw, Profile)
-    except msgspec.ValidationError as error:
-        raise BadInputError(f"profile {source}: {str(error).replace(' - at `$.', ' at `')}") from error
+    profile = parse_toml(text, Profile, f"profile {source}")
     for problem in _problems(profile):
         raise BadInputError(f"profile {source}: {problem}")
     return profile
-
-
-def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str, list[str]]]:
-    """Each key of `raw` that the record `expected` lacks, with its path, and the keys known there."""
-    if isinstance(expected, types.UnionType):
-        expected = typing.get_args(expected)[0]
-    if isinstance(raw, list) and typing.get_origin(expected) is list:
-        for index, item in enumerate(raw):
-            yield from _unknown_keys(item, typing.get_args(expected)[0], f"{where}[{index}]")
-    if not (isinstance(raw, dict) and isinstance(expected, type) and issubclass(expected, msgspec.Struct)):
-        return
-    hints = typing.get_type_hints(expected)
-    known = [name for name in hints if not name.startswith("__")]
-    tag_field = expected.__struct_config__.tag_field
-    for key, value in raw.items():
-        path = f"{where}.{key}".lstrip(".")
-        if key in known:
-            yield from _unknown_keys(value, hints[key], path)
-        elif key != tag_field:
-            yield path, known
 
 
 def _problems(profile: Profile) -> Iterator[str]:

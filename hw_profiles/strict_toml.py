@@ -1,0 +1,57 @@
+"""Strict TOML: text in, a frozen record out, or one line that says which key is wrong.
+
+The law: a key that the record does not know is refused by its path, with the nearest known one beside it.
+"""
+
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import msgspec
+
+from hw_profiles.errors import BadInputError
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A strict record: a key that is not a field of it is an error."""
+
+
+RecordT = TypeVar("RecordT", bound=Record)
+
+
+def parse_toml(text: str, kind: type[RecordT], what: str) -> RecordT:
+    """The record in a TOML text; `what` opens the error line. Raises: BadInputError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadInputError(f"{what}: not TOML: {error}") from error
+    for key, known in _unknown_keys(raw, kind, ""):
+        near = difflib.get_close_matches(key.rsplit(".", 1)[-1], known, n=1, cutoff=0.0)
+        raise BadInputError(f"{what}: unknown key {key}; the nearest known one is {near[0]}")
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise BadInputError(f"{what}: {str(error).replace(' - at `$.', ' at `')}") from error
+
+
+def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str, list[str]]]:
+    """Each key of `raw` that the record `expected` lacks, with its path, and the keys known there."""
+    if isinstance(expected, types.UnionType):
+        expected = typing.get_args(expected)[0]
+    if isinstance(raw, list) and typing.get_origin(expected) is list:
+        for index, item in enumerate(raw):
+            yield from _unknown_keys(item, typing.get_args(expected)[0], f"{where}[{index}]")
+    if not (isinstance(raw, dict) and isinstance(expected, type) and issubclass(expected, msgspec.Struct)):
+        return
+    hints = typing.get_type_hints(expected)
+    known = [name for name in hints if not name.startswith("__")]
+    tag_field = expected.__struct_config__.tag_field
+    for key, value in raw.items():
+        path = f"{where}.{key}".lstrip(".")
+        if key in known:
+            yield from _unknown_keys(value, hints[key], path)
+        elif key != tag_field:
+            yield path, known
