@@ -12,8 +12,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from hw_profiles.errors import BadInputError
@@ -85,12 +87,31 @@ class LogWriter:
     ) -> None:
         """Append one message; without a sequence number it gets the next of its topic."""
         if topic not in self._channels:
-            schema = self._writer.register_schema(msgtype, "ros2msg", schema_text(msgtype).encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+            self._channels[topic] = self._declare(topic, msgtype)
         if sequence is None:
             sequence = self._sequences.get(topic, 0)
         self._sequences[topic] = sequence + 1
         self._writer.add_message(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+
+    def _declare(self, topic: str, msgtype: str) -> int:
+        """Declare a topic in the chunk at hand, and once more outside the chunks.
+
+        A damaged chunk then takes only its own messages with it, not the means to read all that follow.
+        """
+        text = schema_text(msgtype).encode()
+        schema = self._writer.register_schema(msgtype, "ros2msg", text)
+        channel = self._writer.register_channel(topic, "cdr", schema)
+        self._writer.flush()
+        outside = RecordBuilder()
+        Schema(schema, text, "ros2msg", msgtype).write(outside)
+        Channel(channel, topic, "cdr", {}, schema).write(outside)
+        self._file.write(outside.end())
+        return int(channel)
+
+    def add_metadata(self, name: str, record: dict[str, str]) -> None:
+        """Append a metadata record of another name than `rtlog`, which is the first in the file."""
+        self._writer.flush()
+        self._writer.add_metadata(name, record)
 
     def sync(self) -> None:
         """Bring everything written so far to the disk."""
