@@ -28,6 +28,8 @@ class OdometryNoise(Record, frozen=True):
     """How the wheels' error grows: standard deviations per square root of distance or angle travelled."""
 
     distance_m_per_sqrt_m: float = 0.02
+    lateral_m_per_sqrt_m: float = 0.005  # slip to the side, which no wheel counts
+    position_m_per_sqrt_deg: float = 0.001  # scrubbing of the wheels in a turn, ahead and to the side
     heading_deg_per_sqrt_m: float = 0.3
     heading_deg_per_sqrt_deg: float = 0.2
 
