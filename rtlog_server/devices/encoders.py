@@ -1,0 +1,97 @@
+"""What every encoder driver shares: the reading, counting on over many turns, and radians.
+
+In: counts within a turn, and when they were latched. Out: `EncoderReading`; wheels count on over many turns, steering
+is signed about its zero (`contracts.md`: JointState).
+
+An absolute encoder tells where in its turn a wheel is, not how often it went round. Between two readings the wheel went
+on with its speed, give or take what it can accelerate by; of all totals that fit the reading, the nearest to that
+prediction is taken. Where the silence was so long that this could be half a turn off, or the nearest total is no
+possible movement, the total is *doubtful*: the least movement is taken, and the reading says so.
+
+    counts in the turn    4000 |  64      total = 4096 * turns + counts in the turn
+    total                 4000 | 4160     96 onward, not 3936 back
+"""
+
+import math
+from dataclasses import dataclass
+
+from hw_profiles.profile import Encoder
+
+MAX_SPEED_M_S = 5.0  # of a wheel whose speed is not known yet
+MAX_ACCELERATION_M_S2 = 5.0  # more than loose ground lets any wheel brake by; one that spins on it comes out doubtful
+MARGIN_TURNS = 0.1  # what the jitter of stamps and speed may add to a movement
+MAX_SPEED_AGE_NS = 500_000_000  # over a longer gap two readings tell no speed
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderReading:
+    """All encoders that answered in one round; `names`, `counts` and `positions_rad` run in parallel."""
+
+    measured_ns: int  # monotonic; the mean of the moments at which the positions were latched
+    complete_ns: int  # monotonic; when the last answer was in
+    names: tuple[str, ...]  # as in the profile
+    counts: tuple[int, ...]  # as the encoder counts: wheels over many turns, steering within its turn
+    positions_rad: tuple[
+        float, ...
+    ]  # wheels over many turns, steering -π … π about straight ahead; ahead, left positive
+    doubtful: tuple[str, ...]  # wheels that may have turned more often since their last reading than `counts` says
+
+
+def nearest_total(raw: int, modulus: int, near: int) -> int:
+    """Of all numbers congruent to `raw` modulo `modulus`, the one nearest to `near` (half-turn rule)."""
+    return near + (raw - near + modulus // 2) % modulus - modulus // 2
+
+
+def position_rad(encoder: Encoder, counts: int) -> float:
+    """The angle that JointState tells: zero and direction of the profile applied, steering wrapped to -π … π."""
+    turned_rad = 2 * math.pi * counts / encoder.counts_per_turn
+    sign = -1.0 if encoder.reversed else 1.0
+    if encoder.role != "steering":
+        return sign * turned_rad
+    return sign * math.remainder(turned_rad - math.radians(encoder.zero_deg), 2 * math.pi)
+
+
+def counts_at(encoder: Encoder, angle_rad: float) -> int:
+    """The counts within a turn at which `position_rad` tells this angle: the encoder's end of it."""
+    zero_deg = encoder.zero_deg if encoder.role == "steering" else 0.0
+    turned_rad = (-angle_rad if encoder.reversed else angle_rad) + math.radians(zero_deg)
+    return round(turned_rad / (2 * math.pi) * encoder.counts_per_turn) % encoder.counts_per_turn
+
+
+class TurnCounter:
+    """Counts one wheel on over many turns.
+
+    Args:
+        counts_per_turn: of the encoder.
+        modulus: where its readings start again: `counts_per_turn`, or many times that if it counts turns itself.
+        wheel_radius_m: tells how fast a wheel of a vehicle can turn.
+    """
+
+    def __init__(self, counts_per_turn: int, modulus: int, wheel_radius_m: float) -> None:
+        self._counts_per_turn = counts_per_turn
+        self._modulus = modulus
+        self._counts_per_m = counts_per_turn / (2 * math.pi * wheel_radius_m)
+        self._last: tuple[int, int] | None = None  # total, latched_ns
+        self._rate: float | None = None  # counts/s
+
+    def count(self, raw: int, latched_ns: int) -> tuple[int, bool]:
+        """The total at a reading, and whether it is doubtful; the first reading is its own total."""
+        if self._last is None:
+            self._last = raw, latched_ns
+            return raw, False
+        last, last_ns = self._last
+        elapsed_s = (latched_ns - last_ns) * 1e-9
+        if self._rate is None:
+            predicted, reach = last, self._counts_per_m * MAX_SPEED_M_S * elapsed_s
+        else:
+            predicted = last + round(self._rate * elapsed_s)
+            reach = self._counts_per_m * MAX_ACCELERATION_M_S2 * elapsed_s**2 / 2
+        total = nearest_total(raw, self._modulus, predicted)
+        movable = reach + MARGIN_TURNS * self._counts_per_turn
+        doubtful = reach >= self._modulus / 2 or abs(total - predicted) > movable
+        if doubtful:
+            total = nearest_total(raw, self._counts_per_turn, last)
+        known = 0 < latched_ns - last_ns <= MAX_SPEED_AGE_NS
+        self._rate = (total - last) / elapsed_s if known else None
+        self._last = total, latched_ns
+        return total, doubtful
