@@ -1,0 +1,145 @@
+"""The telegrams of a SICK LMS111, both directions: commands, replies, events. No I/O, no clock.
+
+In: a payload as `cola.Receiver` cuts it. Out: a `Reply` or a `ScanData`; and the bytes of any of them. A telegram says
+nothing of what came before it, but for an error, which does not name the command that it answers: the host must have
+only one command under way.
+
+    host     sRN name          sWN name values    sMN name values    sEN name on
+    device   sRA name values   sWA name           sAN name values    sEA name on     sSN name values (event)    sFA code
+
+Source: SICK Telegram Listing 8014631, §4; LMS500 operating instructions 8013796, §10.2; captured sessions of an LMS111.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from rtlog_server.devices.lms111.cola import Dialect, frame, split_command
+from rtlog_server.devices.lms111.fields import open_reader, open_writer
+from rtlog_server.devices.lms111.scan_data import ScanData, read_scan_data
+
+AUTHORISED_CLIENT = (3, 0xF4724744)  # level, and the hash of its factory password
+
+SCAN_CONFIGURATION = "IHIii"  # frequency 1/100 Hz, number of sectors, resolution, start, stop in 1/10000°
+OUTPUT_RANGE = "HIii"  # number of sectors, resolution, start, stop in 1/10000°
+# Echoes (2), remission, its resolution (0: 8 bit, 1: 16 bit), its unit, encoder (2), position, name, comment, time,
+# every nth scan:
+SCAN_CONTENT = "BBBBBBBBBBBH"
+
+# The values of each telegram in the letters of `fields`, `s` for a text; what is not here has none that we know.
+LAYOUTS = {
+    "sFA": "H",
+    "sMN SetAccessMode": "BI",
+    "sAN SetAccessMode": "B",  # 1: granted
+    "sAN Run": "B",
+    "sAN LMCstartmeas": "B",  # 0: done
+    "sAN LMCstopmeas": "B",
+    "sAN LMCstandby": "B",
+    "sAN mEEwriteall": "B",
+    "sMN mLMPsetscancfg": SCAN_CONFIGURATION,
+    "sAN mLMPsetscancfg": "B" + SCAN_CONFIGURATION,  # 0: done
+    "sRA LMPscancfg": SCAN_CONFIGURATION,
+    "sRA LMPoutputRange": OUTPUT_RANGE,
+    "sWN LMPoutputRange": OUTPUT_RANGE,
+    "sRA LMDscandatacfg": SCAN_CONTENT,
+    "sWN LMDscandatacfg": SCAN_CONTENT,
+    "sRA SCdevicestate": "B",
+    "sRA LCMstate": "B",
+    "sRA DeviceIdent": "ss",
+    "sRA FirmwareVersion": "s",
+    "sRA LocationName": "s",
+    "sRA ODoprh": "I",  # operating time in 0.1 h
+    "sRA ODpwrc": "I",  # times powered on
+    "sMN LSPsetdatetime": "HBBBBBI",
+    "sAN LSPsetdatetime": "B",
+    "sWN EIHstCola": "B",  # 0: CoLa A, 1: CoLa B
+    "sEN LMDscandata": "B",
+    "sEA LMDscandata": "B",
+    "sEN LFErec": "B",
+    "sEA LFErec": "B",
+    "sEN LIDinputstate": "B",
+    "sEA LIDinputstate": "B",
+    "sEN LIDoutputstate": "B",
+    "sEA LIDoutputstate": "B",
+}
+
+STATES = {
+    0: "undefined",
+    1: "initialising",
+    2: "in configuration",
+    3: "idle",
+    4: "rotating",
+    5: "in preparation",
+    6: "ready",
+    7: "measuring",
+}
+MEASURING = 7
+
+ERRORS = {  # of sFA
+    1: "access denied at this level",
+    2: "unknown method",
+    3: "unknown variable",
+    4: "local condition failed",
+    5: "invalid data",
+    6: "unknown error",
+    7: "too much data",
+    8: "too little data",
+    9: "unknown type",
+    10: "variable is write-protected",
+    11: "unknown command for the name server",
+    12: "unknown CoLa command",
+    13: "busy",
+    14: "index out of bounds",
+    15: "unknown event",
+    16: "value too large",
+    17: "invalid character",
+    39: "write mode not enabled",
+}
+
+REPLY_VERBS = {"sRN": "sRA", "sWN": "sWA", "sMN": "sAN", "sEN": "sEA"}
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Any telegram but LMDscandata: `name` with its verb, as in `sRA LMPscancfg`."""
+
+    name: str
+    values: tuple[Any, ...] = ()
+
+
+def reply_name(command: str) -> str:
+    """`sRA LMPscancfg` for `sRN LMPscancfg`."""
+    return REPLY_VERBS[command[:3]] + command[3:]
+
+
+def encode_command(dialect: Dialect, command: str, *values: Any) -> bytes:
+    """A telegram ready for the wire, `encode_command(Dialect.B, "sEN LMDscandata", 1)`.
+
+    Raises:
+        ValueError, struct.error: the values are not those of the command.
+    """
+    writer = open_writer(dialect, command)
+    layout = LAYOUTS.get(command, "")
+    for code, value in zip(layout, values, strict=True):
+        if code == "s":
+            writer.text(value)
+        else:
+            writer.put(code, value)
+    return frame(dialect, writer.payload())
+
+
+def decode(dialect: Dialect, payload: bytes) -> Command | ScanData:
+    """What a payload says. Bytes behind the last known value are let pass: newer firmware may add some.
+
+    Raises:
+        ColaError: the payload is no telegram, or too short for its command.
+    """
+    name, arguments = split_command(payload)
+    reader = open_reader(dialect, arguments)
+    if name in ("sSN LMDscandata", "sRA LMDscandata"):
+        return read_scan_data(reader)
+    if name == "sRA STlms":
+        (state,) = reader.take("B")
+        # Manuals disagree on whether the state has 8 or 16 bits in CoLa B; no state needs the upper byte.
+        return Command(name, (state or reader.take("B")[0],))
+    layout = LAYOUTS.get(name, "")
+    return Command(name, tuple(reader.text() if code == "s" else reader.take(code)[0] for code in layout))
