@@ -6,7 +6,6 @@ fields in the same order. The law: a telegram is as long as its counts say or lo
 Source: SICK Telegram Listing 8014631, "LMDscandata"; LMS500 operating instructions 8013796, pp. 81-84; captured scans.
 """
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from rtlog_server.devices.lms111.fields import Array, Reader, Writer, open_write
 HEADER = "HHIBBHHIIBBBBHII"
 MAX_ENCODERS = 3
 MAX_CHANNELS = 8  # of 16 and of 8 bit each; two echoes with remission are four
+MAX_SCALE = 1e6
 CONTENT_CHARACTERS = 5
 EVENT_CHARACTERS = 4
 
@@ -144,7 +144,7 @@ def _flag(reader: Reader) -> bool:
 def _read_channel(reader: Reader, code: str) -> Channel:
     content = reader.characters(CONTENT_CHARACTERS)
     scale_factor, scale_offset, start_angle, step, count = reader.take("ffiHH")
-    if not (math.isfinite(scale_factor) and math.isfinite(scale_offset)):
+    if not (0 < scale_factor <= MAX_SCALE and abs(scale_offset) <= MAX_SCALE):
         raise ColaError(f"channel {content!r} is scaled by {scale_factor} and {scale_offset}")
     return Channel(content, scale_factor, scale_offset, start_angle, step, reader.array(code, count))
 
