@@ -12,6 +12,7 @@ needs on top, and are checked with the rest. Lengths in metres, angles in degree
 """
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -159,6 +160,8 @@ def parse_profile(text: str, source: str) -> Profile:
 
 def _problems(profile: Profile) -> Iterator[str]:
     """What the types cannot say."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", profile.name):  # it is a part of every zenoh key
+        yield f"name is {profile.name!r}; it must be letters, digits, _ . and -, the first a letter or digit"
     if not 0.01 <= profile.tick_period_s <= 10.0:
         yield f"tick_period_s is {profile.tick_period_s}; it must lie in 0.01 … 10"
     vehicle = profile.vehicle

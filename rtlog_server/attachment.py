@@ -1,6 +1,6 @@
 """The attachment of every sample on zenoh: 32 bytes that say which sample of which run of the server it is. A leaf.
 
-    boot id (16 bytes, UUID) | tick index u64 | sequence number u64, counted per topic from 0 |    little endian
+boot id (16 bytes, UUID) | tick index u64 | sequence number u64, counted per topic from 0 |    little endian
 """
 
 import struct

@@ -1,0 +1,173 @@
+"""The server's main path: open the devices, then tick, collect, queue; and to the end what was sampled goes out.
+
+    this process, SCHED_FIFO                                    │ publishing process
+    driver threads ──samples──> tick loop ──bundles──> outbox ──┼──> zenoh, diagnostics, status
+                                                                │
+The law: neither a device nor the network can delay a tick. A device that is away is MISSING; a publishing process that
+does not keep up costs counted ticks, and one that died ends the server (systemd starts it anew).
+"""
+
+import gc
+import logging
+import multiprocessing
+import signal
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any
+
+from hw_profiles.errors import RTLogError
+from hw_profiles.profile import Profile
+from rtlog_server.bundle import Bundle, DeviceReport, Report, ServerInfo
+from rtlog_server.devices import open_devices
+from rtlog_server.devices.device import Device
+from rtlog_server.health import STATE_NAMES, notify, status_line
+from rtlog_server.outbox import Outbox
+from rtlog_server.realtime import become_realtime, freeze_garbage
+from rtlog_server.sampler import Sampler
+from rtlog_server.ticker import Lateness, TickTime, aligned_grid, ticks, utc_offset_ns
+
+log = logging.getLogger(__name__)
+
+QUEUE_TICKS = 300  # 30 s, some 2 MB: longer than a publishing process ever stood still and was well again
+REPORT_NS = 1_000_000_000
+COLLECT_TICKS = 100  # a garbage collection after every so many ticks; below a millisecond once all is frozen
+CLOSE_DEVICES_S = 0.5
+CLOSE_PUBLISHER_S = 5.0
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def run(profile: Profile, profile_toml: str) -> None:
+    """Sample and publish until SIGINT or SIGTERM.
+
+    Raises:
+        BadInputError: the profile lacks a device section.
+        RTLogError: the publishing process failed: one line that says why.
+    """
+    devices = open_devices(profile)
+    stop_requests: list[int] = []
+    for number in END_SIGNALS:
+        signal.signal(number, lambda number, _: stop_requests.append(number))
+    info = ServerInfo(
+        boot_id=uuid.uuid4(),
+        vehicle=profile.name,
+        software=f"rtlog {version('rtlog')}",
+        profile_toml=profile_toml,
+        listen=profile.zenoh.listen,
+        started_ns=time.monotonic_ns(),
+    )
+    log.info("boot %s of %s: %s", info.boot_id, info.vehicle, ", ".join(device.name for device in devices))
+    publisher = PublishingProcess(info)
+    realtime = become_realtime()  # after the other process, which must not inherit it; its sender, though, must
+    log.info("real time: %s", "; ".join(f"{key} {answer}" for key, answer in realtime.items()))
+    publisher.outbox.start()
+    try:
+        sample_for_ever(profile.tick_period_s, devices, publisher, realtime, stopped=lambda: bool(stop_requests))
+    finally:
+        notify("STOPPING=1")
+        close_devices(devices)
+        publisher.close()
+
+
+def sample_for_ever(
+    period_s: float,
+    devices: Sequence[Device[Any]],
+    publisher: "PublishingProcess",
+    realtime: dict[str, str],
+    stopped: Callable[[], bool],
+) -> None:
+    """The tick loop."""
+    period_ns, offset_ns = round(period_s * 1e9), utc_offset_ns()
+    sampler, lateness, reporter = Sampler(devices, offset_ns), Lateness(period_ns), ReportTimer()
+    grid = aligned_grid(period_ns, offset_ns, time.monotonic_ns())
+    for device in devices:
+        device.start(grid)
+    freeze_garbage()
+    for tick in ticks(grid, stopped):
+        publisher.check()
+        samples, device_reports = sampler.sample(tick)
+        lateness.add(tick)
+        report = None
+        if reporter.due(tick, device_reports):
+            stamp_ns, dropped = tick.began_ns + offset_ns, publisher.outbox.dropped
+            report = Report(stamp_ns, device_reports, lateness.summary(), dropped, realtime)
+            notify(f"WATCHDOG=1\nSTATUS={status_line(report)}")
+        publisher.outbox.put(Bundle(tick.index, samples, report))
+        if tick.index % COLLECT_TICKS == 0:
+            gc.collect()
+
+
+class ReportTimer:
+    """Says when a report is due: once a second, and when a device's state changes."""
+
+    def __init__(self) -> None:
+        self._states: list[int] | None = None
+        self._next_ns = 0
+
+    def due(self, tick: TickTime, devices: Sequence[DeviceReport]) -> bool:
+        states = [device.state for device in devices]
+        if states != self._states:
+            log.info("tick %d: %s", tick.index, ", ".join(f"{d.name} {STATE_NAMES[d.state]}" for d in devices))
+        elif tick.scheduled_ns < self._next_ns:
+            return False
+        self._states, self._next_ns = states, tick.scheduled_ns + REPORT_NS
+        return True
+
+
+def close_devices(devices: Sequence[Device[Any]]) -> None:
+    """Tell all of them to stop, then wait for all at once; one that hangs in a system call ends with the process."""
+    deadline = time.monotonic() + CLOSE_DEVICES_S
+    for device in devices:
+        device.close(timeout_s=0.0)
+    for device in devices:
+        device.close(timeout_s=max(0.0, deadline - time.monotonic()))
+
+
+class PublishingProcess:
+    """The other process, and the outbox to it."""
+
+    def __init__(self, info: ServerInfo) -> None:
+        context = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_publish, args=(theirs, info), name="publish", daemon=True)
+        # Ctrl-C and systemd signal both processes, but the publisher must outlive the last tick: it inherits a mask
+        # that blocks them for good, and ends when the pipe does. (The tracker of multiprocessing, if it were started
+        # by `start`, would undo the mask.)
+        resource_tracker.ensure_running()
+        previous = signal.pthread_sigmask(signal.SIG_BLOCK, END_SIGNALS)
+        self._process.start()
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+        theirs.close()
+        self.outbox = Outbox(self._connection, QUEUE_TICKS)
+
+    def check(self) -> None:
+        """Hear what the process has to say. Raises: RTLogError: it failed, or it is gone."""
+        if not self._connection.poll():
+            return
+        try:
+            failure = self._connection.recv()
+        except (EOFError, ConnectionResetError):
+            self._process.join()
+            failure = f"the publishing process ended (exit status {self._process.exitcode})"
+        if failure:
+            raise RTLogError(failure)
+        log.info("publishing")
+        notify("READY=1")
+
+    def close(self) -> None:
+        """Let everything that was queued go out. Raises: RTLogError: it would not."""
+        drained = self.outbox.close(CLOSE_PUBLISHER_S)
+        if drained:
+            self._process.join(CLOSE_PUBLISHER_S)
+        if self._process.exitcode is None:
+            self._process.kill()
+            raise RTLogError(f"the publishing process did not take the last ticks within {CLOSE_PUBLISHER_S:.0f} s")
+
+
+def _publish(connection: Connection, info: ServerInfo) -> None:
+    from rtlog_server.publish import publish_bundles  # here, so that zenoh is loaded in this process alone
+
+    publish_bundles(connection, info)

@@ -1,0 +1,110 @@
+"""How the server is: for ROS tools (`/diagnostics`), for scripts (`@status`) and for systemd.
+
+In: the sampling process's reports. Out: a DiagnosticArray, a dict ready for JSON, a datagram.
+"""
+
+import math
+import os
+import socket
+import time
+from contextlib import suppress
+from typing import Any
+
+from rtlog_server.bundle import DeviceReport, Report, ServerInfo
+from rtlog_server.messages import MISSING, OK, STALE, DiagnosticArray, DiagnosticStatus, KeyValue, header
+
+STATE_NAMES = {OK: "OK", STALE: "STALE", MISSING: "MISSING"}
+LEVELS = {OK: DiagnosticStatus.OK, STALE: DiagnosticStatus.WARN, MISSING: DiagnosticStatus.ERROR}
+
+
+def diagnostics(report: Report, before: Report | None) -> Any:
+    """A DiagnosticArray: a status for each device, and one for the ticks, which warns of losses since `before`."""
+    return DiagnosticArray(
+        header(report.stamp_ns, ""), [*map(_device_status, report.devices), _server_status(report, before)]
+    )
+
+
+def _device_status(device: DeviceReport) -> Any:
+    values = {
+        "state": STATE_NAMES[device.state],
+        "age_s": f"{device.age_s:.3f}",
+        "connects": str(device.connects),
+        **device.identity,
+        **device.diagnostics,
+    }
+    serial = device.identity.get("serial_number", "")
+    return _status(LEVELS[device.state], device.name, device.message, serial, values)
+
+
+def _server_status(report: Report, before: Report | None) -> Any:
+    lateness = report.lateness
+    dropped = report.dropped_ticks - (before.dropped_ticks if before else 0)
+    overruns = lateness.overruns - (before.lateness.overruns if before else 0)
+    level, message = DiagnosticStatus.OK, "sampling"
+    if dropped or overruns:
+        level, message = DiagnosticStatus.WARN, f"{dropped} ticks dropped, {overruns} late by a period or more"
+    values = {
+        "ticks": str(lateness.count),
+        "dropped_ticks": str(report.dropped_ticks),
+        "overruns": str(lateness.overruns),
+        "lateness_p50_ms": f"{lateness.p50_s * 1e3:.3f}",
+        "lateness_p99_ms": f"{lateness.p99_s * 1e3:.3f}",
+        "lateness_max_ms": f"{lateness.max_s * 1e3:.3f}",
+        **report.realtime,
+    }
+    return _status(level, "server", message, "", values)
+
+
+def _status(level: int, name: str, message: str, hardware_id: str, values: dict[str, str]) -> Any:
+    return DiagnosticStatus(level, name, message, hardware_id, [KeyValue(key, text) for key, text in values.items()])
+
+
+def status(info: ServerInfo, report: Report | None, published: dict[str, int]) -> dict[str, Any]:
+    """What `@status` answers; `published` counts the samples put on zenoh, by topic. Without a report yet, less."""
+    answer: dict[str, Any] = {
+        "boot_id": str(info.boot_id),
+        "vehicle": info.vehicle,
+        "software": info.software,
+        "uptime_s": round((time.monotonic_ns() - info.started_ns) * 1e-9, 3),
+        "published": published,
+    }
+    if report is not None:
+        lateness = report.lateness
+        answer["ticks"] = {
+            "sampled": lateness.count,
+            "dropped": report.dropped_ticks,
+            "overruns": lateness.overruns,
+            "lateness_s": {"p50": lateness.p50_s, "p99": lateness.p99_s, "max": lateness.max_s},
+            "histogram": [{"up_to_s": edge, "count": count} for edge, count in lateness.histogram],
+        }
+        answer["realtime"] = report.realtime
+        answer["devices"] = {device.name: _device_answer(device) for device in report.devices}
+    return answer
+
+
+def _device_answer(device: DeviceReport) -> dict[str, Any]:
+    return {
+        "state": STATE_NAMES[device.state],
+        "age_s": round(device.age_s, 6) if math.isfinite(device.age_s) else None,  # JSON has no infinity
+        "message": device.message,
+        "connects": device.connects,
+        "identity": device.identity,
+        "diagnostics": device.diagnostics,
+    }
+
+
+def status_line(report: Report) -> str:
+    """One line for `systemctl status`."""
+    states = ", ".join(f"{device.name} {STATE_NAMES[device.state]}" for device in report.devices)
+    return f"{report.lateness.count} ticks, {report.dropped_ticks} dropped; {states}"
+
+
+def notify(message: str) -> None:
+    """Tell systemd (sd_notify(3)): READY=1, STATUS=…, WATCHDOG=1, STOPPING=1. Does nothing outside a unit."""
+    path = os.environ.get("NOTIFY_SOCKET", "")
+    if not path:
+        return
+    address = "\0" + path[1:] if path.startswith("@") else path
+    # never wait, never fail: a word that systemd misses is said again, and its watchdog restarts us if none arrive
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender, suppress(OSError):
+        sender.sendto(message.encode(), address)

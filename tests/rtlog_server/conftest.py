@@ -1,0 +1,185 @@
+"""What tests of the whole server share: a profile of devices that are away, the server as a process, a zenoh client."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from rtlog_server.attachment import Attachment, unpack_attachment
+
+PROFILE = """\
+schema = 1
+name = "{name}"
+tick_period_s = {tick_period_s}
+[vehicle]
+kinematics = "differential"
+track_width_m = 1.6
+[lasers.primary]
+device = {{ host = "127.0.0.1", port = {laser_port} }}
+[[encoders]]
+name = "left_wheel"
+role = "left_wheel"
+wheel_radius_m = 0.35
+address = 0
+[[encoders]]
+name = "right_wheel"
+role = "right_wheel"
+wheel_radius_m = 0.35
+address = 1
+[encoder_bus]
+kind = "sei"
+port = "{encoder_port}"
+[rfid]
+device = {{ host = "127.0.0.1", port = {rfid_port} }}
+[zenoh]
+listen = ["tcp/127.0.0.1:{zenoh_port}"]
+"""
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass
+class Received:
+    key: str
+    attachment: Attachment | None
+    payload: bytes
+    encoding: str
+
+
+@dataclass
+class Server:
+    """A server process and a zenoh client of it."""
+
+    process: subprocess.Popen[bytes]
+    stderr: Path
+    name: str
+    session: zenoh.Session
+    received: list[Received] = field(default_factory=list)
+
+    @staticmethod
+    def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, f"not within {timeout_s} s"
+            time.sleep(0.01)
+
+    def get(self, name: str) -> zenoh.Sample:
+        """The one reply to a query."""
+        replies = [reply.ok for reply in self.session.get(f"rtlog/{self.name}/{name}", timeout=5.0)]
+        assert len(replies) == 1
+        assert replies[0] is not None
+        return replies[0]
+
+    def status(self) -> dict:
+        return json.loads(self.get("@status").payload.to_string())
+
+    def on(self, topic: str) -> list[Received]:
+        return [sample for sample in list(self.received) if sample.key == f"rtlog/{self.name}/{topic}"]
+
+    def terminate(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, float]:
+        """The exit status, and how long it took."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        status = self.process.wait(timeout=20)
+        return status, time.monotonic() - began
+
+    def children(self) -> list[int]:
+        """The ids of the processes that the server started."""
+        path = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [int(child) for child in path.read_text().split()]
+
+    def publisher_id(self) -> int:
+        """The id of the publishing process: the child that runs `spawn_main`."""
+        commands = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in self.children()}
+        return next(child for child, command in commands.items() if b"spawn_main" in command)
+
+
+def open_client(zenoh_port: int) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{zenoh_port}"]')
+    config.insert_json5("connect/retry", "{ period_init_ms: 50, period_max_ms: 50 }")
+    config.insert_json5("connect/timeout_ms", "10000")
+    for switch in ("scouting/multicast", "scouting/gossip", "transport/shared_memory"):
+        config.insert_json5(f"{switch}/enabled", "false")
+    return zenoh.open(config)
+
+
+def run_server(folder: Path, toml: str, name: str, zenoh_port: int) -> Generator[Server]:
+    profile, stderr = folder / "profile.toml", folder / "stderr.txt"
+    profile.write_text(toml, encoding="utf-8")
+    command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
+    with stderr.open("wb") as sink:
+        # a session of its own, as under systemd: the signals of this test process's terminal do not reach it
+        process = subprocess.Popen(command, stderr=sink, start_new_session=True)
+    session = None
+    try:
+        session = open_client(zenoh_port)
+        server = Server(process, stderr, name, session)
+        for key in (f"rtlog/{name}/**", f"rtlog/{name}/@heartbeat"):
+            session.declare_subscriber(key, lambda sample: server.received.append(_received(sample)))
+        yield server
+    finally:
+        if session is not None:
+            session.close()
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _received(sample: zenoh.Sample) -> Received:
+    attachment = unpack_attachment(sample.attachment.to_bytes()) if sample.attachment else None
+    return Received(str(sample.key_expr), attachment, sample.payload.to_bytes(), str(sample.encoding))
+
+
+def values_of_absent_devices(folder: Path) -> dict[str, object]:
+    return {
+        "name": "testbed",
+        "tick_period_s": 0.1,
+        "laser_port": free_port(),
+        "encoder_port": folder / "absent",
+        "rfid_port": free_port(),
+        "zenoh_port": free_port(),
+    }
+
+
+@pytest.fixture
+def absent_profile(tmp_path: Path) -> Path:
+    """A profile whose devices are all away."""
+    path = tmp_path / "absent.toml"
+    path.write_text(PROFILE.format(**values_of_absent_devices(tmp_path)), encoding="utf-8")
+    return path
+
+
+StartServer = Callable[..., Server]
+
+
+@pytest.fixture(scope="module")
+def start_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartServer]:
+    """Starts servers with the given values in the profile; what is not given leads to a device that is away."""
+    running: list[Generator[Server]] = []
+
+    def start(**values: object) -> Server:
+        folder = tmp_path_factory.mktemp("server")
+        filled = values_of_absent_devices(folder) | values
+        server = run_server(folder, PROFILE.format(**filled), str(filled["name"]), int(str(filled["zenoh_port"])))
+        running.append(server)
+        return next(server)
+
+    yield start
+    for server in running:
+        server.close()

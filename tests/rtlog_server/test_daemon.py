@@ -1,0 +1,172 @@
+"""The server as a process, heard by a real zenoh client; its devices are away unless a test says otherwise."""
+
+import json
+import os
+import signal
+import time
+import tomllib
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtlog_server.messages import MISSING, decode, to_ns
+from rtlog_server.topics import BY_NAME
+
+PERIOD_NS = 100_000_000
+StartServer = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def server(start_server: StartServer) -> Any:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 12)
+    return server
+
+
+def ticks_of(server: Any) -> list[Any]:
+    return [decode(sample.payload, BY_NAME["/rtlog/tick"].msgtype) for sample in server.on("rtlog/tick")]
+
+
+def test_ticks_flow_on_the_grid_whatever_the_devices_do(server: Any) -> None:
+    ticks = ticks_of(server)
+    first = ticks[0].index
+    assert [tick.index for tick in ticks] == list(range(first, first + len(ticks)))
+    scheduled = [to_ns(tick.scheduled) for tick in ticks]
+    assert {later - earlier for earlier, later in pairwise(scheduled)} == {PERIOD_NS}
+    assert all(min(stamp % PERIOD_NS, -stamp % PERIOD_NS) == 0 for stamp in scheduled)
+    assert abs(time.time_ns() - scheduled[-1]) < 5e9
+    for tick in ticks:
+        assert {sensor.name: sensor.state for sensor in tick.sensors} == dict.fromkeys(
+            ("laser/primary", "encoders", "rfid"), MISSING
+        )
+        assert all(sensor.age == float("inf") for sensor in tick.sensors)
+        assert to_ns(tick.header.stamp) - to_ns(tick.scheduled) == pytest.approx(tick.lateness * 1e9, abs=2)
+    assert {sample.key.split("/", 2)[2] for sample in server.received} == {"rtlog/tick", "diagnostics", "@heartbeat"}
+
+
+def test_every_sample_says_boot_tick_and_sequence(server: Any) -> None:
+    samples = server.on("rtlog/tick")
+    for sample, tick in zip(samples, ticks_of(server), strict=False):
+        assert sample.attachment.tick == sample.attachment.sequence == tick.index
+        assert sample.encoding == "application/cdr;rtlog_msgs/msg/Tick"
+    assert {str(sample.attachment.boot_id) for sample in samples} == {server.status()["boot_id"]}
+    diagnostics = [sample.attachment.sequence for sample in server.on("diagnostics")]
+    assert diagnostics == list(range(diagnostics[0], diagnostics[0] + len(diagnostics)))
+
+
+def test_heartbeat_tells_the_last_numbers_at_1_hz(server: Any) -> None:
+    server.wait_until(lambda: len(server.on("@heartbeat")) >= 3)
+    beats = [json.loads(beat.payload) for beat in server.on("@heartbeat")]
+    assert {beat["boot_id"] for beat in beats} == {server.status()["boot_id"]}
+    steps = [later["last_tick"] - earlier["last_tick"] for earlier, later in pairwise(beats)]
+    assert all(8 <= step <= 12 for step in steps), steps
+    assert beats[-1]["last_sequence"]["/rtlog/tick"] == beats[-1]["last_tick"]
+
+
+def test_liveliness_token_names_the_boot(server: Any) -> None:
+    replies = server.session.liveliness().get(f"rtlog/{server.name}/@server/*", timeout=5.0)
+    keys = [str(reply.ok.key_expr) for reply in replies]
+    assert keys == [f"rtlog/{server.name}/@server/{server.status()['boot_id']}"]
+
+
+def test_profile_is_the_toml_as_written(server: Any) -> None:
+    text = server.get("@profile").payload.to_string()
+    assert text == (server.stderr.parent / "profile.toml").read_text()
+    assert tomllib.loads(text)["name"] == server.name
+
+
+def test_status_says_how_the_server_is(server: Any) -> None:
+    status = server.status()
+    assert status["vehicle"] == server.name
+    assert status["software"].startswith("rtlog ")
+    assert status["uptime_s"] > 1
+    assert status["published"]["/rtlog/tick"] >= 12
+    ticks = status["ticks"]
+    assert ticks["sampled"] == sum(bin_["count"] for bin_ in ticks["histogram"]) >= 10
+    assert 0 < ticks["lateness_s"]["p50"] <= ticks["lateness_s"]["p99"] <= ticks["lateness_s"]["max"]
+    assert ticks["dropped"] == 0
+    assert status["realtime"].keys() == {"scheduler", "memory"}
+    assert {name: device["state"] for name, device in status["devices"].items()} == dict.fromkeys(
+        ("laser/primary", "encoders", "rfid"), "MISSING"
+    )
+    assert "absent" in status["devices"]["encoders"]["message"]
+    assert status["devices"]["encoders"]["age_s"] is None
+
+
+def test_diagnostics_at_1_hz_name_what_is_missing(server: Any) -> None:
+    server.wait_until(lambda: len(server.on("diagnostics")) >= 2)
+    latest = decode(server.on("diagnostics")[-1].payload, BY_NAME["/diagnostics"].msgtype)
+    levels = {status.name: status.level for status in latest.status}
+    assert levels.keys() == {"laser/primary", "encoders", "rfid", "server"}
+    assert levels["encoders"] == levels["rfid"] == levels["laser/primary"] == 2
+    stamps = [to_ns(decode(s.payload, BY_NAME["/diagnostics"].msgtype).header.stamp) for s in server.on("diagnostics")]
+    assert all(0.9e9 < later - earlier < 1.5e9 for earlier, later in pairwise(stamps))
+
+
+def test_nobody_is_looked_for(server: Any) -> None:
+    """One listener and no discovery: nothing on the network hears of the server unless it asks there."""
+    process = Path(f"/proc/{server.publisher_id()}")
+    ours = {str(link.readlink()) for link in (process / "fd").iterdir() if link.is_symlink()}
+    udp = [line.split() for line in (process / "net/udp").read_text().splitlines()[1:]]
+    tcp = [line.split() for line in (process / "net/tcp").read_text().splitlines()[1:]]
+    listening = "0A"
+    assert not [line for line in udp if f"socket:[{line[9]}]" in ours]
+    assert len([line for line in tcp if f"socket:[{line[9]}]" in ours and line[3] == listening]) == 1
+
+
+def test_zenoh_and_sampling_are_two_processes(server: Any) -> None:
+    assert "zenoh" not in Path(f"/proc/{server.process.pid}/maps").read_text()
+    assert "zenoh" in Path(f"/proc/{server.publisher_id()}/maps").read_text()
+
+
+def test_a_tick_that_was_missed_comes_late_and_says_so(start_server: StartServer) -> None:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 5)
+    server.process.send_signal(signal.SIGSTOP)
+    stopped_ns = time.time_ns()
+    time.sleep(0.5)
+    continued_ns = time.time_ns()
+    server.process.send_signal(signal.SIGCONT)
+    server.wait_until(lambda: bool(ticks_of(server)) and to_ns(ticks_of(server)[-1].scheduled) > continued_ns + 3e8)
+    ticks = ticks_of(server)
+    assert [tick.index for tick in ticks] == list(range(ticks[0].index, ticks[0].index + len(ticks)))
+    missed = [tick for tick in ticks if stopped_ns < to_ns(tick.scheduled) < continued_ns]
+    assert len(missed) in (4, 5)
+    for tick in missed:
+        expected_s = (continued_ns - to_ns(tick.scheduled)) * 1e-9
+        assert expected_s <= tick.lateness < expected_s + 0.1
+    assert all(tick.lateness < 0.1 for tick in ticks if to_ns(tick.scheduled) > continued_ns + 1e8)
+    server.wait_until(lambda: server.status()["ticks"]["overruns"] >= 3)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_everything_published(start_server: StartServer, number: signal.Signals) -> None:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 5)
+    os.killpg(server.process.pid, number)  # as a terminal or systemd does: to both processes
+    began = time.monotonic()
+    assert server.process.wait(timeout=10) == 0
+    assert time.monotonic() - began < 2.0
+    beat = json.loads(server.on("@heartbeat")[-1].payload)
+    assert beat["last_sequence"]["/rtlog/tick"] == beat["last_tick"] == ticks_of(server)[-1].index
+    assert "Traceback" not in server.stderr.read_text()
+
+
+def test_it_does_not_outlive_its_publishing_process(start_server: StartServer) -> None:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 2)
+    os.kill(server.publisher_id(), signal.SIGKILL)
+    assert server.process.wait(timeout=5) == 1
+    last_line = server.stderr.read_text().splitlines()[-1]
+    assert last_line == "rtlog-server: the publishing process ended (exit status -9)"
+
+
+def test_its_publishing_process_does_not_outlive_it(start_server: StartServer) -> None:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 2)
+    publisher = server.publisher_id()
+    server.process.kill()
+    server.wait_until(lambda: not Path(f"/proc/{publisher}").exists())
