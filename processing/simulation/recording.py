@@ -106,7 +106,7 @@ def write_recording(
                 put(topics.PRIMARY_SCAN, scan_message(int(sweep_ns[k]), samples.ranges[k]), int(sweep_ns[k]))
             joints = joint_message(int(latched_ns[k]), names, samples.positions[k])
             put(topics.JOINT_STATES, joints, int(latched_ns[k]))
-            put(topics.TAGS, tags_message(int(round_ns[k]), start_ns, reads.get(k, [])), int(round_ns[k]))
+            put(topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns)
 
 
 def tick_message(index: int, scheduled_ns: int, begun_ns: int, newest_ns: dict[str, int]) -> object:
@@ -131,7 +131,7 @@ def scan_message(stamp_ns: int, ranges: NDArray[np.float32]) -> object:
         angle_increment=float(np.radians(0.5)),
         time_increment=sensors.BEAM_PERIOD_S,
         scan_time=sensors.SWEEP_PERIOD_S,
-        range_min=0.05,
+        range_min=0.016,
         range_max=sensors.LONGEST_RANGE_M,
         ranges=ranges,
         intensities=np.empty(0, dtype=np.float32),
