@@ -1,0 +1,156 @@
+"""Maps on disk: what nav2's map_server reads, and a picture for people.
+
+In: a `Grid`. Out: `map.pgm` and `map.yaml` (trinary: 0 occupied, 254 free, 205 unknown; the first line of pixels is the
+largest y), and `map.png` with the graph over it. Law: the same grid gives the same bytes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from hw_profiles.errors import BadInputError
+from processing.geometry import Array
+from processing.occupancy_grid import Grid
+
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # pixels
+OCCUPIED_ABOVE = 1.0  # log-odds: more than a single hit
+FREE_BELOW = -0.3  # log-odds: one look is enough
+PICTURE_PIXELS = 1200, 4000  # the longer side of the picture: at least, at most (up to the whole factor)
+MARGIN_PIXELS = 50  # room for the scale bar and the names at the rim
+WALL, OPEN, DARK = (38, 38, 46), (255, 255, 255), (206, 208, 212)
+BLUE, RED, INK = (30, 100, 200), (205, 40, 30), (20, 20, 20)
+
+
+@dataclass(frozen=True, slots=True)
+class MapImage:
+    pixels: NDArray[np.uint8]  # (H, W) OCCUPIED, FREE or UNKNOWN; row 0 is the smallest y
+    resolution_m: float
+    origin: Array  # (2,) x, y of the lower-left corner of pixel [0, 0]
+
+    def occupied_points(self) -> Array:
+        """The centres (n, 2) of the occupied cells."""
+        rows, columns = np.nonzero(self.pixels == OCCUPIED)
+        return self.origin + self.resolution_m * (np.column_stack([columns, rows]) + 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """What the picture shows over the map, in its frame."""
+
+    nodes: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (k, 2)
+    names: Sequence[str] = ()  # k
+    edges: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (e, 2, 2) from, to; x, y
+    trajectories: Sequence[Array] = ()  # (n, 2) each
+
+
+def to_image(grid: Grid) -> MapImage:
+    """The grid in three values."""
+    pixels = np.full(grid.log_odds.shape, UNKNOWN, dtype=np.uint8)
+    pixels[grid.log_odds > OCCUPIED_ABOVE] = OCCUPIED
+    pixels[grid.log_odds < FREE_BELOW] = FREE
+    return MapImage(pixels, grid.resolution_m, grid.origin)
+
+
+def write_map(folder: Path, grid: Grid, overlay: Overlay | None = None) -> None:
+    """Write map.pgm, map.yaml and map.png into the folder, which exists; of a grid without cells, one unknown pixel."""
+    image = to_image(grid)
+    if not image.pixels.size:
+        image = MapImage(np.full((1, 1), UNKNOWN, dtype=np.uint8), image.resolution_m, image.origin)
+    height, width = image.pixels.shape
+    (folder / "map.pgm").write_bytes(b"P5\n%d %d\n255\n" % (width, height) + image.pixels[::-1].tobytes())
+    x, y = (float(value) for value in np.round(image.origin, 6) + 0.0)
+    (folder / "map.yaml").write_text(
+        f"image: map.pgm\nmode: trinary\nresolution: {float(image.resolution_m)!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+        encoding="utf-8",
+    )
+    draw_map(image, overlay or Overlay()).save(folder / "map.png")
+
+
+def read_map(folder: Path) -> MapImage:
+    """Read map.yaml and the image that it names, as `write_map` or nav2's map_saver wrote them.
+
+    Raises:
+        BadInputError: a file is missing or malformed, or the map is turned (an origin with a yaw) or negated.
+    """
+    path = folder / "map.yaml"
+    try:
+        pairs = [line.split(":", 1) for line in path.read_text(encoding="utf-8").splitlines() if ":" in line]
+        entries = {key.strip(): value.strip() for key, value in pairs}
+        resolution_m = float(entries["resolution"])
+        x, y, yaw = (float(word) for word in entries["origin"].strip("[]").split(","))
+        image_path = folder / entries["image"]
+        if yaw != 0 or entries.get("negate", "0") not in ("0", "false") or not resolution_m > 0:
+            raise BadInputError(f"{path}: only maps without yaw, not negated, with a resolution above 0 are read")
+        with Image.open(image_path) as image:
+            occupancy = 1.0 - np.asarray(image.convert("L"), dtype=np.float64)[::-1] / 255.0
+    except KeyError as error:
+        raise BadInputError(f"{path}: the key {error.args[0]} is missing") from error
+    except (ValueError, SyntaxError) as error:
+        raise BadInputError(f"{path}: {error}") from error
+    except OSError as error:
+        raise BadInputError(f"{path}: {error.strerror or error}") from error
+    pixels = np.full(occupancy.shape, UNKNOWN, dtype=np.uint8)
+    pixels[occupancy > float(entries.get("occupied_thresh", 0.65))] = OCCUPIED
+    pixels[occupancy < float(entries.get("free_thresh", 0.196))] = FREE
+    return MapImage(pixels, resolution_m, np.array([x, y]))
+
+
+def draw_map(image: MapImage, overlay: Overlay) -> Image.Image:
+    """The picture: walls dark, free white, unknown grey; trajectories, edges and named nodes over it; a scale bar."""
+    height, width = image.pixels.shape
+    least, most = PICTURE_PIXELS
+    enlarge, shrink = max(1, least // max(height, width)), -(-max(height, width) // most)
+    pixels = _shrink(image.pixels, shrink)[::-1].repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    colours = np.array([DARK] * 256, dtype=np.uint8)
+    colours[OCCUPIED], colours[FREE] = WALL, OPEN
+    framed = np.pad(pixels, MARGIN_PIXELS, constant_values=UNKNOWN)
+    picture = Image.fromarray(colours[framed])
+    pixels_per_m = enlarge / shrink / image.resolution_m
+    draw = ImageDraw.Draw(picture)
+
+    def place(points: Array) -> list[tuple[float, float]]:
+        x, y = ((np.asarray(points) - image.origin) * pixels_per_m).T
+        below = picture.height - MARGIN_PIXELS
+        return [(float(a) + MARGIN_PIXELS, below - float(b)) for a, b in zip(x, y, strict=True)]
+
+    for trajectory in overlay.trajectories:
+        draw.line(place(trajectory), fill=(150, 190, 240), width=1)
+    for edge in overlay.edges:
+        draw.line(place(edge), fill=BLUE, width=2)
+    font = ImageFont.load_default(size=14)
+    for (x, y), name in zip(place(overlay.nodes), overlay.names, strict=True):
+        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=RED, outline=OPEN)
+        draw.text((x + 8, y - 8), name, fill=RED, font=font, stroke_width=2, stroke_fill=OPEN)
+    _draw_scale_bar(draw, picture, pixels_per_m, font)
+    return picture
+
+
+def _shrink(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """One pixel of `factor`² each: a wall shows if any is one, else free if any is."""
+    if factor == 1:
+        return pixels
+    pad = [(0, -size % factor) for size in pixels.shape]
+    height, width = (size + more[1] for size, more in zip(pixels.shape, pad, strict=True))
+    blocks = np.pad(pixels, pad, constant_values=UNKNOWN).reshape(height // factor, factor, width // factor, factor)
+    lowest, highest = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
+    return np.where(lowest == OCCUPIED, lowest, highest)
+
+
+def _draw_scale_bar(
+    draw: ImageDraw.ImageDraw,
+    picture: Image.Image,
+    pixels_per_m: float,
+    font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
+) -> None:
+    wanted_m = (picture.width - 2 * MARGIN_PIXELS) / pixels_per_m / 5
+    decade = 10.0 ** np.floor(np.log10(wanted_m))
+    length_m = float(decade * max(step for step in (1, 2, 5) if step * decade <= wanted_m * (1 + 1e-9)))
+    x, y = 15.0, picture.height - 15.0
+    end = x + length_m * pixels_per_m
+    draw.line([(x, y - 5), (x, y), (end, y), (end, y - 5)], fill=INK, width=2)
+    draw.text((x + 5, y - 22), f"{length_m:g} m", fill=INK, font=font, stroke_width=2, stroke_fill=OPEN)

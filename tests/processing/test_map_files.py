@@ -1,0 +1,113 @@
+"""A map goes to disk as nav2 wants it and comes back; a picture shows the walls even when it is shrunk."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image
+
+from hw_profiles.errors import BadInputError
+from processing.map_files import (
+    FREE,
+    MARGIN_PIXELS,
+    OCCUPIED,
+    UNKNOWN,
+    WALL,
+    MapImage,
+    Overlay,
+    draw_map,
+    read_map,
+    to_image,
+    write_map,
+)
+from processing.occupancy_grid import Grid
+
+
+@pytest.fixture
+def grid() -> Grid:
+    log_odds = np.zeros((30, 50), dtype=np.float32)
+    log_odds[5:25, 5:40] = -2
+    log_odds[5, 5:40] = 3  # the wall at the smallest y
+    log_odds[24, 39] = 0.85  # one hit is no wall
+    return Grid(log_odds, 0.05, np.array([-1.25, 3.0]))
+
+
+def test_what_is_written_is_what_nav2_reads(tmp_path: Path, grid: Grid) -> None:
+    write_map(tmp_path, grid)
+    data = (tmp_path / "map.pgm").read_bytes()
+    assert data.startswith(b"P5\n50 30\n255\n")
+    assert len(data) == 13 + 50 * 30
+    picture = np.asarray(Image.open(tmp_path / "map.pgm"))
+    assert (picture[24, 10], picture[10, 10], picture[0, 0], picture[5, 39]) == (0, 254, 205, 205)
+    lines = (tmp_path / "map.yaml").read_text().splitlines()
+    assert {"image: map.pgm", "resolution: 0.05", "origin: [-1.25, 3.0, 0.0]", "negate: 0"} <= set(lines)
+
+
+def test_round_trip(tmp_path: Path, grid: Grid) -> None:
+    write_map(tmp_path, grid)
+    back = read_map(tmp_path)
+    assert_array_equal(back.pixels, to_image(grid).pixels)
+    assert (back.resolution_m, *back.origin) == (0.05, -1.25, 3.0)
+    points = back.occupied_points()
+    assert len(points) == 35
+    assert_allclose(points[:, 1], 3.0 + 5.5 * 0.05)
+    assert_allclose(points[0, 0], -1.25 + 5.5 * 0.05)
+
+
+def test_same_grid_same_bytes(tmp_path: Path, grid: Grid) -> None:
+    overlay = Overlay(
+        np.array([[-1.0, 3.5]]), ["E200"], np.array([[[-1.0, 3.5], [0.0, 4.0]]]), [np.array([[0, 3.5]] * 2)]
+    )
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_map(tmp_path / name, grid, overlay)
+    for file in ("map.pgm", "map.yaml", "map.png"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_empty_grid_is_written(tmp_path: Path) -> None:
+    write_map(tmp_path, Grid(np.zeros((0, 0), dtype=np.float32), 0.05, np.zeros(2)))
+    assert read_map(tmp_path).pixels.tolist() == [[UNKNOWN]]
+
+
+def test_shrunk_pictures_keep_thin_walls() -> None:
+    pixels = np.full((9001, 200), FREE, dtype=np.uint8)
+    pixels[4321] = OCCUPIED
+    picture = np.asarray(draw_map(MapImage(pixels, 0.05, np.zeros(2)), Overlay()))
+    assert picture.shape[0] == 9001 // 3 + 1 + 2 * MARGIN_PIXELS
+    rows = np.flatnonzero((picture[:, MARGIN_PIXELS + 30] == WALL).all(axis=1))
+    assert_array_equal(rows, [picture.shape[0] - 1 - MARGIN_PIXELS - 4321 // 3])
+
+
+def test_nodes_are_drawn_where_they_are() -> None:
+    pixels = np.full((100, 100), FREE, dtype=np.uint8)
+    plain = np.asarray(draw_map(MapImage(pixels, 0.05, np.array([10.0, 20.0])), Overlay())).astype(int)
+    with_node = draw_map(MapImage(pixels, 0.05, np.array([10.0, 20.0])), Overlay(np.array([[11.0, 24.0]]), [""]))
+    rows, columns = np.nonzero(np.abs(np.asarray(with_node).astype(int) - plain).sum(axis=2))
+    assert_allclose([columns.mean(), rows.mean()], [MARGIN_PIXELS + 240, MARGIN_PIXELS + 240], atol=1)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("resolution: 0.05\n", ""), "resolution is missing"),
+        (("0.05", "wide"), "could not convert"),
+        (("3.0, 0.0]", "3.0, 1.0]"), "without yaw"),
+        (("map.pgm", "none.pgm"), "No such file"),
+        (("negate: 0", "negate: 1"), "not negated"),
+    ],
+)
+def test_bad_maps_are_refused(tmp_path: Path, grid: Grid, change: tuple[str, str], complaint: str) -> None:
+    write_map(tmp_path, grid)
+    path = tmp_path / "map.yaml"
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(BadInputError, match=complaint):
+        read_map(tmp_path)
+
+
+def test_damaged_image_is_refused(tmp_path: Path, grid: Grid) -> None:
+    write_map(tmp_path, grid)
+    (tmp_path / "map.pgm").write_bytes(b"P5\n50 30\n255\n\x00")
+    with pytest.raises(BadInputError, match="map"):
+        read_map(tmp_path)
