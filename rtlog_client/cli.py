@@ -1,0 +1,98 @@
+"""rtlog-client record | recover | replay | audit: the laptop's commands. Only here is anything printed."""
+
+import argparse
+import json
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from hw_profiles.command import add_verb, run_verbs
+from rtlog_client.live_line import LiveLine
+from rtlog_client.record import record
+from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
+from rtlog_client.recover import recover
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="rtlog-client", description="Records, mends, checks and replays drives.")
+    verbs = parser.add_subparsers(metavar="VERB")
+
+    verb = add_verb(verbs, "record", _record, "record what a server publishes", "rtlog-client record -o recordings")
+    verb.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the recordings")
+    verb.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help="default: %(default)s")
+    verb.add_argument("--vehicle", help="default: the only one there")
+    verb.add_argument("--name", metavar="STEM", help="of the file; default: UTC date and vehicle")
+    verb.add_argument("--duration", type=_seconds, metavar="S", help="stop so long after the first tick")
+    verb.add_argument("--json", action="store_true", help="the summary as JSON")
+
+    example = "rtlog-client recover recordings/20260304T071500Z_canmet_trailer.mcap.part"
+    verb = add_verb(verbs, "recover", _recover, "mend a recording that was cut off or damaged", example)
+    verb.add_argument("recording", type=Path, metavar="FILE", help="NAME.mcap.part or NAME.mcap; it is only read")
+    verb.add_argument("-o", "--output", type=Path, metavar="OUT.mcap", help="default: NAME.mcap, NAME.recovered.mcap")
+    verb.add_argument("--json", action="store_true", help="what came back as JSON")
+
+    return run_verbs(parser, argv)
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is no number of seconds above 0")
+    return seconds
+
+
+def _stop_on_signals() -> threading.Event:
+    """Set at the first SIGINT or SIGTERM; the next one ends the program the hard way."""
+    stopping = threading.Event()
+
+    def stop(number: int, _frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        stopping.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return stopping
+
+
+def _log_to_stderr(prefix: str = "") -> None:
+    logging.basicConfig(format=f"{prefix}%(message)s", level=logging.INFO, stream=sys.stderr, force=True)
+
+
+def _record(args: argparse.Namespace) -> None:
+    line = LiveLine(sys.stderr)
+    _log_to_stderr(line.clear)
+    config = RecordConfig(args.output, args.connect, args.vehicle, args.name, args.duration)
+    summaries = record(config, _stop_on_signals(), line.show)
+    if args.json:
+        print(json.dumps([{**asdict(s), "path": str(s.path)} for s in summaries]))
+        return
+    for summary in summaries:
+        print(f"{summary.path}  {summary.ticks} ticks  {summary.size_bytes / 1e6:.1f} MB")
+        for topic, count in summary.messages.items():
+            print(f"  {topic:24}{count:9} messages{summary.lost.get(topic, 0):9} lost")
+
+
+def _recover(args: argparse.Namespace) -> None:
+    total = args.recording.stat().st_size if args.recording.is_file() else 0
+    with tqdm(total=total, unit="B", unit_scale=True, delay=1.0, disable=None, leave=False) as bar:
+        recovery = recover(args.recording, args.output, lambda position: bar.update(position - bar.n))
+    if args.json:
+        print(json.dumps({**asdict(recovery), "path": str(recovery.path)}))
+        return
+    count = sum(recovery.messages.values())
+    print(f"{recovery.path}: {count} messages; {args.recording} is left as it is")
+    if recovery.was_whole:
+        print("  it was whole: there was nothing to mend")
+    else:
+        lost = f"{recovery.damaged_chunks} damaged chunks and {recovery.orphans} messages without their topic left out"
+        print(f"  {lost}, {recovery.skipped_bytes} bytes unreadable")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
