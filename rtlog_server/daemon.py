@@ -21,19 +21,18 @@ from typing import Any
 
 from hw_profiles.errors import RTLogError
 from hw_profiles.profile import Profile
-from rtlog_server.bundle import Bundle, DeviceReport, Report, ServerInfo
+from rtlog_server.bundle import Bundle, Report, ServerInfo
 from rtlog_server.devices import open_devices
 from rtlog_server.devices.device import Device
-from rtlog_server.health import STATE_NAMES, notify, status_line
+from rtlog_server.health import ReportTimer, notify, status_line
 from rtlog_server.outbox import Outbox
 from rtlog_server.realtime import become_realtime, freeze_garbage
 from rtlog_server.sampler import Sampler
-from rtlog_server.ticker import Lateness, TickTime, aligned_grid, ticks, utc_offset_ns
+from rtlog_server.ticker import Lateness, aligned_grid, ticks, utc_offset_ns
 
 log = logging.getLogger(__name__)
 
 QUEUE_TICKS = 300  # 30 s, some 2 MB: longer than a publishing process ever stood still and was well again
-REPORT_NS = 1_000_000_000
 COLLECT_TICKS = 100  # a garbage collection after every so many ticks; below a millisecond once all is frozen
 CLOSE_DEVICES_S = 0.5
 CLOSE_PUBLISHER_S = 5.0
@@ -98,23 +97,6 @@ def sample_for_ever(
         publisher.outbox.put(Bundle(tick.index, samples, report))
         if tick.index % COLLECT_TICKS == 0:
             gc.collect()
-
-
-class ReportTimer:
-    """Says when a report is due: once a second, and when a device's state changes."""
-
-    def __init__(self) -> None:
-        self._states: list[int] | None = None
-        self._next_ns = 0
-
-    def due(self, tick: TickTime, devices: Sequence[DeviceReport]) -> bool:
-        states = [device.state for device in devices]
-        if states != self._states:
-            log.info("tick %d: %s", tick.index, ", ".join(f"{d.name} {STATE_NAMES[d.state]}" for d in devices))
-        elif tick.scheduled_ns < self._next_ns:
-            return False
-        self._states, self._next_ns = states, tick.scheduled_ns + REPORT_NS
-        return True
 
 
 def close_devices(devices: Sequence[Device[Any]]) -> None:

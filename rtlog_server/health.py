@@ -3,18 +3,41 @@
 In: the sampling process's reports. Out: a DiagnosticArray, a dict ready for JSON, a datagram.
 """
 
+import logging
 import math
 import os
 import socket
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 from rtlog_server.bundle import DeviceReport, Report, ServerInfo
 from rtlog_server.messages import MISSING, OK, STALE, DiagnosticArray, DiagnosticStatus, KeyValue, header
+from rtlog_server.ticker import TickTime
 
+log = logging.getLogger(__name__)
+
+REPORT_NS = 1_000_000_000
 STATE_NAMES = {OK: "OK", STALE: "STALE", MISSING: "MISSING"}
 LEVELS = {OK: DiagnosticStatus.OK, STALE: DiagnosticStatus.WARN, MISSING: DiagnosticStatus.ERROR}
+
+
+class ReportTimer:
+    """Says when a report is due: once a second, and when a device's state changes."""
+
+    def __init__(self) -> None:
+        self._states: list[int] | None = None
+        self._next_ns = 0
+
+    def due(self, tick: TickTime, devices: Sequence[DeviceReport]) -> bool:
+        states = [device.state for device in devices]
+        if states != self._states:
+            log.info("tick %d: %s", tick.index, ", ".join(f"{d.name} {STATE_NAMES[d.state]}" for d in devices))
+        elif tick.scheduled_ns < self._next_ns:
+            return False
+        self._states, self._next_ns = states, tick.scheduled_ns + REPORT_NS
+        return True
 
 
 def diagnostics(report: Report, before: Report | None) -> Any:

@@ -1,12 +1,14 @@
 """At a tick: what every device handed over since the last one, as the contract's messages.
 
-    tick k-1          tick k                  a sample belongs to the first tick at or after its completion, also when
-    ──┼───s──s──s──s──┼───s──s── time         that tick comes late: it is collected by the tick's scheduled time, so
-      └── collected ──┘                       a process that stood still loses no sample that the drivers still read
+    tick k-1          tick k                  a sample belongs to the first tick at or after its completion, by the
+    ──┼───s──s──s──s──┼───s──s── time         scheduled time of the tick, also when that comes late
+      └── collected ──┘
 
 In: devices and a `TickTime`. Out: `Sample`s, the Tick first. Of scanner and encoders the newest of the tick is sent, of
-the reader all of it, in one message. Monotonic nanoseconds come in, UTC goes out. A tick made up for after the process
-stood still says STALE of a device that had nobody to hear it; that is what was known at the time.
+the reader all of it, in one message. Monotonic nanoseconds come in, UTC goes out.
+
+After the whole process stood still, the missed ticks hold what the drivers had handed over in time, and say STALE of a
+device that nobody could hear: that is what was known. What still lay in sockets goes to the first tick after that.
 """
 
 from collections.abc import Callable, Sequence

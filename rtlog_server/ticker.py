@@ -79,7 +79,7 @@ class Lateness:
         self._max_ns = max(self._max_ns, tick.lateness_ns)
 
     def summary(self) -> LatenessSummary:
-        max_s = self._max_ns * 1e-9
+        max_s = self._max_ns / 1e9
         edges = [min(edge, max_s) for edge in BIN_EDGES_S] + [max_s]
         totals = list(itertools.accumulate(self._counts))
         p50_s, p99_s = (edges[bisect_left(totals, q * totals[-1])] for q in (0.5, 0.99))

@@ -45,7 +45,7 @@ listen = ["tcp/127.0.0.1:{zenoh_port}"]
 """
 
 
-def free_port() -> int:
+def find_free_port() -> int:
     """A TCP port that nobody listens on now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -108,7 +108,7 @@ class Server:
         return next(child for child, command in commands.items() if b"spawn_main" in command)
 
 
-def open_client(zenoh_port: int) -> zenoh.Session:
+def connect_client(zenoh_port: int) -> zenoh.Session:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{zenoh_port}"]')
@@ -128,7 +128,7 @@ def run_server(folder: Path, toml: str, name: str, zenoh_port: int) -> Generator
         process = subprocess.Popen(command, stderr=sink, start_new_session=True)
     session = None
     try:
-        session = open_client(zenoh_port)
+        session = connect_client(zenoh_port)
         server = Server(process, stderr, name, session)
         for key in (f"rtlog/{name}/**", f"rtlog/{name}/@heartbeat"):
             session.declare_subscriber(key, lambda sample: server.received.append(_received(sample)))
@@ -150,11 +150,22 @@ def values_of_absent_devices(folder: Path) -> dict[str, object]:
     return {
         "name": "testbed",
         "tick_period_s": 0.1,
-        "laser_port": free_port(),
+        "laser_port": find_free_port(),
         "encoder_port": folder / "absent",
-        "rfid_port": free_port(),
-        "zenoh_port": free_port(),
+        "rfid_port": find_free_port(),
+        "zenoh_port": find_free_port(),
     }
+
+
+@pytest.fixture
+def free_port() -> int:
+    return find_free_port()
+
+
+@pytest.fixture
+def open_client() -> Callable[[int], zenoh.Session]:
+    """Opens a client session to a server on a port of this host."""
+    return connect_client
 
 
 @pytest.fixture
