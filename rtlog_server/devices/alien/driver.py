@@ -207,16 +207,20 @@ class Alr9650(Device[TagSample]):
 
     def _new_reads(self, tag: TagRead) -> int:
         """How many reads a line adds to what was told of this tag: readers count on while a tag is on their list."""
-        before = self._seen.pop((tag.epc, tag.antenna), None)
-        self._seen[tag.epc, tag.antenna] = tag  # at the end: the longest unread goes first
+        key = tag.epc, tag.antenna
+        before = self._seen.get(key)
+        if before is not None and tag.discovered_ms == before.discovered_ms:
+            times = tag.last_seen_ms, before.last_seen_ms
+            if times[0] is not None and times[1] is not None and (times[0], tag.count) <= (times[1], before.count):
+                return 0  # told already
+            reads = tag.count - before.count if tag.count > before.count else tag.count
+        else:
+            reads = tag.count
+        self._seen.pop(key, None)
+        self._seen[key] = tag  # at the end: the longest unread goes first
         if len(self._seen) > MAX_TAGS:
             del self._seen[next(iter(self._seen))]
-        if before is None or tag.discovered_ms != before.discovered_ms:
-            return tag.count
-        times = tag.last_seen_ms, before.last_seen_ms
-        if times[0] is not None and times[1] is not None and (times[0], tag.count) <= (times[1], before.count):
-            return 0  # told already
-        return tag.count - before.count if tag.count > before.count else tag.count
+        return reads
 
     def _tell_health(self, polling: bool) -> None:
         if polling:

@@ -1,0 +1,93 @@
+"""Counting on over many turns, and the angles that JointState tells."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hw_profiles.profile import Encoder
+from rtlog_server.devices.encoders import TurnCounter, counts_at, nearest_total, position_rad
+
+COUNTS = 4096
+RADIUS_M = 0.35
+TURN_M = 2 * math.pi * RADIUS_M
+TICK_NS = 100_000_000
+STEERING = Encoder(name="steering", role="steering", counts_per_turn=COUNTS, zero_deg=350.0)
+WHEEL = Encoder(name="wheel", role="left_wheel", counts_per_turn=COUNTS, wheel_radius_m=RADIUS_M)
+
+
+def counts_of(distance_m: float) -> int:
+    return math.floor(distance_m / TURN_M * COUNTS)
+
+
+@given(st.integers(-(10**9), 10**9), st.integers(0, COUNTS - 1))
+def test_the_nearest_total_fits_the_reading_and_lies_within_half_a_turn(near: int, raw: int) -> None:
+    total = nearest_total(raw, COUNTS, near)
+    assert total % COUNTS == raw
+    assert -COUNTS // 2 <= total - near <= COUNTS // 2
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(-0.4, 0.4), min_size=20, max_size=60), st.floats(-0.3, 0.3))
+def test_a_wheel_counts_on_through_any_drive(accelerations_m_s_tick: list[float], first_m: float) -> None:
+    counter = TurnCounter(COUNTS, COUNTS, RADIUS_M)
+    distance_m, speed_m_s = first_m, 0.0
+    offset = counts_of(distance_m) - counts_of(distance_m) % COUNTS
+    for index, change_m_s in enumerate(accelerations_m_s_tick):
+        total, doubtful = counter.count(counts_of(distance_m) % COUNTS, index * TICK_NS)
+        assert total == counts_of(distance_m) - offset
+        assert not doubtful
+        speed_m_s = max(-8.0, min(8.0, speed_m_s + change_m_s))
+        distance_m += speed_m_s * 0.1
+
+
+def test_a_gap_that_the_speed_bridges_is_counted_and_a_longer_one_is_doubtful() -> None:
+    speed_m_s = 5.0
+    counter = TurnCounter(COUNTS, COUNTS, RADIUS_M)
+    for index in range(3):
+        counter.count(counts_of(speed_m_s * 0.1 * index) % COUNTS, index * TICK_NS)
+    # 0.5 s on: more than a turn further, which only the speed tells
+    at_s = 0.7
+    assert counter.count(counts_of(speed_m_s * at_s) % COUNTS, int(at_s * 1e9)) == (counts_of(speed_m_s * at_s), False)
+    at_s += 3.0
+    total, doubtful = counter.count(counts_of(speed_m_s * at_s) % COUNTS, int(at_s * 1e9))
+    assert doubtful
+    assert total % COUNTS == counts_of(speed_m_s * at_s) % COUNTS
+    assert abs(total - counts_of(speed_m_s * 0.7)) <= COUNTS // 2  # the least movement
+
+
+def test_a_jump_that_no_wheel_can_make_is_doubtful() -> None:
+    counter = TurnCounter(COUNTS, COUNTS, RADIUS_M)
+    assert counter.count(100, 0) == (100, False)
+    assert counter.count(110, TICK_NS) == (110, False)
+    assert counter.count(110 + COUNTS // 3, 2 * TICK_NS)[1]
+
+
+def test_an_encoder_that_counts_turns_bridges_any_gap_until_it_loses_power() -> None:
+    modulus = COUNTS * 65536
+    counter = TurnCounter(COUNTS, modulus, RADIUS_M)
+    assert counter.count(modulus - 5, 0) == (modulus - 5, False)
+    assert counter.count(3, TICK_NS) == (modulus + 3, False)  # over the end of the turn count
+    assert counter.count(20 * COUNTS, 60 * 10**9) == (modulus + 20 * COUNTS, False)
+    # power lost: the turns start at 0 again, the place within the turn stays
+    total, doubtful = counter.count(40, 60 * 10**9 + TICK_NS)
+    assert doubtful
+    assert total == modulus + 20 * COUNTS + 40
+
+
+@given(st.floats(-math.pi + 0.01, math.pi - 0.01), st.booleans(), st.floats(-360, 360))
+def test_steering_is_signed_about_its_zero(angle_rad: float, is_reversed: bool, zero_deg: float) -> None:
+    encoder = Encoder(name="s", role="steering", counts_per_turn=COUNTS, zero_deg=zero_deg, reversed=is_reversed)
+    counts = counts_at(encoder, angle_rad)
+    assert 0 <= counts < COUNTS
+    assert position_rad(encoder, counts) == pytest.approx(angle_rad, abs=math.pi / COUNTS + 1e-9)
+
+
+def test_angles_have_the_sign_that_the_profile_says() -> None:
+    zero = round(350 / 360 * COUNTS)
+    assert position_rad(STEERING, (zero + 114) % COUNTS) == pytest.approx(math.radians(10.0), abs=2e-3)
+    assert position_rad(WHEEL, 3 * COUNTS) == pytest.approx(6 * math.pi)
+    backward = Encoder(name="w", role="left_wheel", wheel_radius_m=RADIUS_M, reversed=True)
+    assert position_rad(backward, 3 * COUNTS) == pytest.approx(-6 * math.pi)
+    assert counts_at(backward, -math.pi) == COUNTS // 2
