@@ -9,7 +9,7 @@ from rtlog_server.devices import open_devices
 from rtlog_server.devices.device import Device, TickGrid
 
 TIME_LIMIT_S = 3.0  # an encoder bus left at the wrong speed takes a second attempt
-FIRST_SAMPLE_S = 1.0
+FIRST_SAMPLES_S = 1.0
 POLL_S = 0.02
 
 
@@ -44,14 +44,13 @@ def _wait_for(device: Device[Any], deadline: float) -> str:
         if time.monotonic() > deadline:
             return device.message
         time.sleep(POLL_S)
-    deadline = time.monotonic() + FIRST_SAMPLE_S
-    while device.connected and time.monotonic() < deadline:
-        if device.collect(time.monotonic_ns()).samples:
-            break
+    deadline = time.monotonic() + FIRST_SAMPLES_S
+    samples = 0
+    while samples < 2 and device.connected and time.monotonic() < deadline:  # at the second, the first is judged
         time.sleep(POLL_S)
-    else:
-        if device.name != "rfid":  # without a tag nearby a reader has nothing to tell
-            return f"connected, but no data came within {FIRST_SAMPLE_S:.0f} s"
+        samples += len(device.collect(time.monotonic_ns()).samples)
+    if device.connected and not samples and device.name != "rfid":  # without a tag nearby a reader has nothing to tell
+        return f"connected, but no data came within {FIRST_SAMPLES_S:.0f} s"
     return "" if device.message == "connected" else device.message
 
 

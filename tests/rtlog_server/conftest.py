@@ -1,20 +1,27 @@
-"""What tests of the whole server share: a profile of devices that are away, the server as a process, a zenoh client."""
+"""What tests of the whole server share: profiles, emulated devices, the server as a process, a zenoh client of it."""
 
 import json
+import math
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
+import numpy as np
 import pytest
 import zenoh
 
 from rtlog_server.attachment import Attachment, unpack_attachment
+from rtlog_server.devices.alien.emulator import Alr9650Emulator
+from rtlog_server.devices.lms111.emulator import Lms111Emulator
+from rtlog_server.devices.sei.emulator import SeiBusEmulator
 
 PROFILE = """\
 schema = 1
@@ -146,6 +153,57 @@ def _received(sample: zenoh.Sample) -> Received:
     return Received(str(sample.key_expr), attachment, sample.payload.to_bytes(), str(sample.encoding))
 
 
+class Drive:
+    """Three emulators, and a thread that lets scanner and reader measure: scan k has all ranges 1 m + k mm."""
+
+    RAYS, STEP_RAD = 541, math.radians(0.5)
+    COUNTS_PER_TURN = 4096
+    TURNS_PER_S: ClassVar = {0: 0.8, 1: -0.3}  # by encoder address
+
+    def __init__(self, folder: Path) -> None:
+        self.laser = Lms111Emulator()
+        encoders = dict.fromkeys(self.TURNS_PER_S, self.COUNTS_PER_TURN)
+        self.encoders = SeiBusEmulator(folder / "sei", encoders, self._counts)
+        self.rfid = Alr9650Emulator()
+        self.places = {
+            "laser_port": self.laser.address[1],
+            "encoder_port": folder / "sei",
+            "rfid_port": self.rfid.port,
+        }
+        self.first_rays_ns: list[int] = []
+        self.tag_reads = 0
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._measure)
+        self._thread.start()
+
+    def _counts(self, address: int, now_ns: int) -> int:
+        return round(self.TURNS_PER_S[address] * self.COUNTS_PER_TURN * now_ns * 1e-9)
+
+    def _measure(self) -> None:
+        while not self._stopping.wait(0.02):
+            ranges_m = np.full(self.RAYS, 1.0 + len(self.first_rays_ns) * 1e-3)
+            self.first_rays_ns.append(time.monotonic_ns())
+            start_rad, remission = math.radians(-135), np.full(self.RAYS, 100.0)
+            self.laser.send_scan(ranges_m, self.first_rays_ns[-1], start_rad, self.STEP_RAD, remission)
+
+    def read_tag(self, epc: str) -> None:
+        self.rfid.read_tag(epc)
+        self.tag_reads += 1
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        for emulator in (self.laser, self.encoders, self.rfid):
+            emulator.close()
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
+    drive = Drive(tmp_path_factory.mktemp("drive"))
+    yield drive
+    drive.close()
+
+
 def values_of_absent_devices(folder: Path) -> dict[str, object]:
     return {
         "name": "testbed",
@@ -173,6 +231,14 @@ def absent_profile(tmp_path: Path) -> Path:
     """A profile whose devices are all away."""
     path = tmp_path / "absent.toml"
     path.write_text(PROFILE.format(**values_of_absent_devices(tmp_path)), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def drive_profile(tmp_path: Path, drive: Drive) -> Path:
+    """A profile of the emulated devices."""
+    path = tmp_path / "drive.toml"
+    path.write_text(PROFILE.format(**values_of_absent_devices(tmp_path) | drive.places), encoding="utf-8")
     return path
 
 
