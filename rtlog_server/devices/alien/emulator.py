@@ -63,7 +63,7 @@ class Alr9650Emulator:
         """A tag in the field is read now; unheard while the reader is not in AutoMode."""
         with self._changed:
             line = self._reader.read_tag(epc, antenna, rssi, count, self._now_ms())
-            if line is not None:
+            if line is not None and self._stream_address is not None:
                 self._lines.append(line)
                 self._changed.notify_all()
 
@@ -164,8 +164,14 @@ class Alr9650Emulator:
 
     def _execute(self, command: str) -> str:
         reply = self._reader.execute(command, self._now_ms())
+        if self._stream_address is None:
+            self._lines.clear()
         self._changed.notify_all()
         return reply
+
+    @property
+    def _stream_address(self) -> tuple[str, int] | None:
+        return None if self.refuse_stream else self._reader.stream_address
 
     def _now_ms(self) -> int:
         return (time.monotonic_ns() - self._booted_ns) // 1_000_000
@@ -180,7 +186,7 @@ class Alr9650Emulator:
             with self._changed:
                 if not self._lines:
                     self._changed.wait(WATCH_S)
-                address = None if self.refuse_stream else self._reader.stream_address
+                address = self._stream_address
                 idle_s = int(self._reader.settings["TagStreamKeepAliveTime"])
             if stream is not None and (address != opened_for or time.monotonic() - sent_s > idle_s or hung_up(stream)):
                 stream.close()

@@ -47,7 +47,7 @@ class Splitter:
     def __init__(self, terminators: bytes, limit: int) -> None:
         self._cut = re.compile(b"[" + re.escape(terminators) + b"]")
         self._limit = limit
-        self._rest = b""
+        self._rest = bytearray()
 
     @property
     def rest(self) -> str:
@@ -56,11 +56,16 @@ class Splitter:
 
     def feed(self, data: bytes) -> list[str]:
         """The pieces that are complete now, without their terminators. Raises: AlienError, one grew too long."""
-        *pieces, self._rest = self._cut.split(self._rest + data)
+        pieces = []
+        first, *others = self._cut.split(data)
+        self._rest += first
+        for following in others:
+            pieces.append(self.rest)
+            self._rest = bytearray(following)
         if max(map(len, [*pieces, self._rest])) > self._limit:
-            self._rest = b""
+            self._rest.clear()
             raise AlienError(f"more than {self._limit} bytes without an end")
-        return [piece.decode("latin-1") for piece in pieces]
+        return pieces
 
 
 def console_splitter() -> Splitter:
@@ -180,7 +185,7 @@ def _parse_date_ms(text: str) -> int:
     year, month, day, hour, minute, second = (int(part) for part in match.groups()[:6])
     if not (1 <= month <= 12 and 1 <= day <= 31):
         raise AlienError(f"no date: {text[:40]!r}")
-    year += 2000 if year < 100 else 0
+    year += 2000 if len(match[1]) == 2 else 0
     return calendar.timegm((year, month, day, hour, minute, second)) * 1000 + int((match[7] or "0").ljust(3, "0"))
 
 
