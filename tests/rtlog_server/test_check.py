@@ -45,7 +45,7 @@ def test_one_silent_encoder_is_named(drive: Any, drive_profile: Path) -> None:
 def test_a_device_that_takes_the_connection_and_says_nothing_is_away(drive: Any, drive_profile: Path) -> None:
     drive.laser.go_silent()
     try:
-        laser = check_devices(load_profile(drive_profile))[0]
+        laser = check_devices(load_profile(drive_profile), time_limit_s=1.5)[0]
     finally:
         drive.laser.go_silent(silent=False)
     assert not laser.reachable

@@ -142,6 +142,21 @@ def test_a_tick_that_was_missed_comes_late_and_says_so(start_server: StartServer
     server.wait_until(lambda: server.status()["ticks"]["overruns"] >= 3)
 
 
+def test_a_publishing_process_that_stands_still_delays_no_tick(start_server: StartServer) -> None:
+    server = start_server()
+    server.wait_until(lambda: len(server.on("rtlog/tick")) >= 3)
+    publisher = server.publisher_id()
+    os.kill(publisher, signal.SIGSTOP)
+    time.sleep(1.0)
+    os.kill(publisher, signal.SIGCONT)
+    continued_ns = time.time_ns()
+    server.wait_until(lambda: to_ns(ticks_of(server)[-1].scheduled) > continued_ns + 2e8)
+    ticks = ticks_of(server)
+    assert [tick.index for tick in ticks] == list(range(ticks[0].index, ticks[0].index + len(ticks)))
+    assert max(tick.lateness for tick in ticks) < 0.1
+    assert server.status()["ticks"]["dropped"] == 0
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_with_everything_published(start_server: StartServer, number: signal.Signals) -> None:
     server = start_server()
