@@ -13,10 +13,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hw_profiles.command import add_verb, run_verbs
+from hw_profiles.profile import parse_profile, read_profile_text
 from rtlog_client.live_line import LiveLine
 from rtlog_client.record import record
 from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
 from rtlog_client.recover import recover
+from rtlog_client.replay import serve_devices
+from rtlog_client.republish import republish
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,6 +40,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("-o", "--output", type=Path, metavar="OUT.mcap", help="default: NAME.mcap, NAME.recovered.mcap")
     verb.add_argument("--json", action="store_true", help="what came back as JSON")
 
+    example = "rtlog-client replay recordings/a.mcap --to devices --profile simulated"
+    verb = add_verb(verbs, "replay", _replay, "play a recording to the device emulators or on zenoh", example)
+    verb.add_argument("recording", type=Path, metavar="RUN.mcap")
+    verb.add_argument("--to", choices=("zenoh", "devices"), required=True, help="publish it, or be its devices")
+    verb.add_argument(
+        "--profile", default="simulated", metavar="P", help="says at which addresses; default: %(default)s"
+    )
+    verb.add_argument("--start", type=_start, default=0.0, metavar="S", help="so long after the recording's start")
+    verb.add_argument("--duration", type=_seconds, metavar="S", help="default: to the end")
+
     return run_verbs(parser, argv)
 
 
@@ -45,6 +58,10 @@ def _seconds(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is no number of seconds above 0")
     return seconds
+
+
+def _start(text: str) -> float:
+    return 0.0 if text == "0" else _seconds(text)
 
 
 def _stop_on_signals() -> threading.Event:
@@ -92,6 +109,17 @@ def _recover(args: argparse.Namespace) -> None:
     else:
         lost = f"{recovery.damaged_chunks} damaged chunks and {recovery.orphans} messages without their topic left out"
         print(f"  {lost}, {recovery.skipped_bytes} bytes unreadable")
+
+
+def _replay(args: argparse.Namespace) -> None:
+    _log_to_stderr()
+    profile_toml = read_profile_text(args.profile)
+    profile = parse_profile(profile_toml, args.profile)
+    stopping, part = _stop_on_signals(), {"start_s": args.start, "duration_s": args.duration}
+    if args.to == "devices":
+        print(json.dumps(asdict(serve_devices(args.recording, profile, stopping, **part))))
+    else:
+        print(json.dumps(asdict(republish(args.recording, profile, profile_toml, stopping, **part))))
 
 
 if __name__ == "__main__":

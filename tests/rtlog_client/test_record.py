@@ -237,7 +237,7 @@ def test_the_door(start_server: StartServer, tmp_path: Path) -> None:
 def test_several_vehicles_are_named(start_server: StartServer, tmp_path: Path) -> None:
     server = start_server(vehicle="one")
     server.declare_presence("two")
-    with pytest.raises(BadInputError, match="several vehicles .*: one, two"):
+    with pytest.raises(BadInputError, match=r"several vehicles .*: one, two"):
         record(RecordConfig(tmp_path, server.endpoint), threading.Event())
 
 
