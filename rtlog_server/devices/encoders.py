@@ -52,9 +52,11 @@ def position_rad(encoder: Encoder, counts: int) -> float:
 
 
 def counts_at(encoder: Encoder, angle_rad: float) -> int:
-    """The counts within a turn at which `position_rad` tells this angle: the encoder's end of it."""
-    zero_deg = encoder.zero_deg if encoder.role == "steering" else 0.0
-    turned_rad = (-angle_rad if encoder.reversed else angle_rad) + math.radians(zero_deg)
+    """The counts at which `position_rad` tells this angle, the encoder's end of it: steering within its turn."""
+    turned_rad = -angle_rad if encoder.reversed else angle_rad
+    if encoder.role != "steering":
+        return round(turned_rad / (2 * math.pi) * encoder.counts_per_turn)
+    turned_rad += math.radians(encoder.zero_deg)
     return round(turned_rad / (2 * math.pi) * encoder.counts_per_turn) % encoder.counts_per_turn
 
 

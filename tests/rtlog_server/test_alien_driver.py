@@ -198,11 +198,30 @@ def test_a_driver_that_ends_leaves_the_console_free(emulator: Alr9650Emulator, s
         assert reader.device.connects == 1
 
 
+def test_the_console_is_left_with_a_goodbye(start: Callable[..., Reader]) -> None:
+    heard = bytearray()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        reader = start(server.getsockname()[1])
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Username>\0")
+            while not heard.endswith(b"set AutoMode = ON\r\n"):
+                heard += client.recv(4096)
+                client.sendall(b"Password>\0" if heard == b"alien\r\n" else b"Alien>\0\r\n\0" * (heard[-2:] == b"\r\n"))
+            reader.wait_for(lambda: reader.device.connected)
+            reader.device.close()
+            while received := client.recv(4096):
+                heard += received
+    assert heard.endswith(b"\x01Quit\r\n")
+
+
 def test_without_a_stream_the_tag_list_is_polled_until_there_is_one(
     emulator: Alr9650Emulator, start: Callable[..., Reader], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(driver, "STREAM_WAIT_S", 0.3)
     emulator.refuse_stream = True
+    emulator.configure("set AutoMode = ON")
+    emulator.read_tag("0BAD")  # is on the list already, and nowhere near when we come
     reader = start(emulator.port)
     reader.wait_until_reading(stream="polling")
     assert "opens no tag stream to 127.0.0.1:" in reader.device.message

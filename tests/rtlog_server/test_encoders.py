@@ -91,3 +91,4 @@ def test_angles_have_the_sign_that_the_profile_says() -> None:
     backward = Encoder(name="w", role="left_wheel", wheel_radius_m=RADIUS_M, reversed=True)
     assert position_rad(backward, 3 * COUNTS) == pytest.approx(-6 * math.pi)
     assert counts_at(backward, -math.pi) == COUNTS // 2
+    assert counts_at(backward, 6 * math.pi) == -3 * COUNTS

@@ -79,7 +79,6 @@ class Alr9650(Device[TagSample]):
         self._selector = selectors.DefaultSelector()
         self._selector.register(console.socket, selectors.EVENT_READ)
         self._selector.register(listener, selectors.EVENT_READ)
-        self._seen = {}
         self._awaiting_reply = False
         self._asked_at = self._no_stream_since = time.monotonic()
 

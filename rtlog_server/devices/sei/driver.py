@@ -79,6 +79,8 @@ class SeiEncoders(Device[EncoderReading]):
 
     def connect(self) -> None:
         self._port = SeiPort(self._bus)
+        if self._bus.baud != protocol.POWER_UP_BAUD:
+            self._port.raise_baud()
         try:
             self._port.learn_echo(list(self._addresses.values()), self._reply_bytes)
         except DeviceError:

@@ -50,8 +50,6 @@ class SeiPort:
         # USB adapters collect bytes for 16 ms unless told otherwise; other ports have no such switch.
         with contextlib.suppress(ValueError):
             self._serial.set_low_latency_mode(True)
-        if bus.baud != protocol.POWER_UP_BAUD:
-            self.raise_baud()
 
     @property
     def echo(self) -> bool:
