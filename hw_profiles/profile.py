@@ -187,3 +187,8 @@ def _problems(profile: Profile) -> Iterator[str]:
             yield f"{where}.wheel_radius_m is {encoder.wheel_radius_m}; a wheel needs it above 0"
         if profile.encoder_bus is not None and not 0 <= (encoder.address if encoder.address is not None else -1) <= 14:
             yield f"{where}.address is {encoder.address}; an encoder on an SEI bus has one in 0 … 14"
+        if profile.encoder_bus is not None and encoder.counts_per_turn > 65536:
+            yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; on an SEI bus it is 65536 or less"
+    addresses = [encoder.address for encoder in profile.encoders if profile.encoder_bus is not None]
+    if len(set(addresses)) != len(addresses):
+        yield f"encoders share an address on the bus: {addresses}"
