@@ -14,6 +14,7 @@ Source: SICK Telegram Listing 8014631, §2.3; captured telegrams.
 
 import re
 import struct
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from rtlog_server.devices.lms111.cola import ETX, STX, ColaError, Dialect
 
 DTYPES: dict[str, Any] = {"B": np.uint8, "H": np.uint16}
 NUMBER = re.compile(rb"[0-9A-Fa-f]{1,16}\Z|[+-][0-9]{1,16}\Z")
-NOT_HEX = re.compile(rb"[^0-9A-Fa-f ]")
 ENCODING = "latin-1"  # every byte is a character and back
 
 Array = NDArray[np.uint8] | NDArray[np.uint16]
@@ -101,15 +101,16 @@ class AsciiReader:
         """(count,) values of one type."""
         if count == 0:
             return np.empty(0, DTYPES[code])
+        dtype = np.dtype(DTYPES[code]).newbyteorder(">")
         tokens = self._data[self._at :].split(b" ", count)[:count]
-        length = sum(map(len, tokens)) + count - 1
-        if len(tokens) < count or NOT_HEX.search(self._data, self._at, self._at + length):
-            raise ColaError(f"{count} hexadecimal values announced at byte {self._at}, fewer are there")
-        self._at += length + 1
+        self._at += sum(map(len, tokens)) + count
         try:
-            return np.array([int(token, 16) for token in tokens], DTYPES[code])
-        except (ValueError, OverflowError) as error:
-            raise ColaError(f"a value before byte {self._at} is no {code}") from error
+            image = bytes.fromhex(b"".join([token.rjust(2 * dtype.itemsize, b"0") for token in tokens]).decode())
+        except ValueError as error:
+            raise ColaError(f"a value before byte {self._at} is not hexadecimal") from error
+        if len(tokens) < count or b"" in tokens or len(image) != count * dtype.itemsize:
+            raise ColaError(f"{count} values announced; before byte {self._at} one is missing or too large")
+        return np.frombuffer(image, dtype).astype(DTYPES[code])
 
     def at_end(self) -> bool:
         return self._at >= len(self._data)
@@ -161,7 +162,7 @@ class AsciiWriter:
             self.characters(text)
 
     def array(self, values: Array) -> None:
-        self._parts += [b"%X" % value for value in values.tolist()]
+        self._parts += hexadecimal()[values].tolist()
 
     def payload(self) -> bytes:
         return b" ".join(self._parts)
@@ -178,6 +179,12 @@ def open_reader(dialect: Dialect, arguments: bytes) -> Reader:
 
 def open_writer(dialect: Dialect, command: str) -> Writer:
     return BinaryWriter(command) if dialect is Dialect.B else AsciiWriter(command)
+
+
+@cache
+def hexadecimal() -> NDArray[np.bytes_]:
+    """(65536,) the digits of each 16-bit number; looking them up takes a tenth of the time that writing them takes."""
+    return np.array([b"%X" % number for number in range(65536)])
 
 
 def _parse(token: bytes, code: str) -> Any:

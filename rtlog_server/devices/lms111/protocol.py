@@ -42,7 +42,8 @@ LAYOUTS = {
     "sWN LMPoutputRange": OUTPUT_RANGE,
     "sRA LMDscandatacfg": SCAN_CONTENT,
     "sWN LMDscandatacfg": SCAN_CONTENT,
-    "sRA SCdevicestate": "B",
+    "sRA STlms": "BBssHHH",  # state, 1: outside of its temperature range, time, date, LEDs
+    "sRA SCdevicestate": "B",  # 0: busy or logged in, 1: ready, 2: error
     "sRA LCMstate": "B",
     "sRA DeviceIdent": "ss",
     "sRA FirmwareVersion": "s",
@@ -51,7 +52,8 @@ LAYOUTS = {
     "sRA ODpwrc": "I",  # times powered on
     "sMN LSPsetdatetime": "HBBBBBI",
     "sAN LSPsetdatetime": "B",
-    "sWN EIHstCola": "B",  # 0: CoLa A, 1: CoLa B
+    "sRA EIHstCola": "B",  # 0: CoLa A, 1: CoLa B, from the next connection on
+    "sWN EIHstCola": "B",
     "sEN LMDscandata": "B",
     "sEA LMDscandata": "B",
     "sEN LFErec": "B",
@@ -72,8 +74,9 @@ STATES = {
     6: "ready",
     7: "measuring",
 }
-MEASURING = 7
+INITIALISING, IDLE, IN_PREPARATION, MEASURING = 1, 3, 5, 7
 
+ACCESS_DENIED, UNKNOWN_METHOD, UNKNOWN_VARIABLE, CONDITION_FAILED, INVALID_DATA, WRITE_PROTECTED = 1, 2, 3, 4, 5, 10
 ERRORS = {  # of sFA
     1: "access denied at this level",
     2: "unknown method",
