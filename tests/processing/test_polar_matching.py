@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from hw_profiles.profile import OdometryNoise
 from processing import geometry, odometry
 from processing.import_carmen import parse_lines
-from processing.polar_matching import match_polar
+from processing.polar_matching import _project, match_polar
 from processing.polar_scan import filter_ranges, fit_normals, label_surfaces
 from processing.relations import read_relations, relation_errors
 
@@ -168,6 +168,19 @@ def test_what_hides_behind_a_corner_does_not_pull() -> None:
     walls = np.vstack([ROOM, polyline((1.5, 2.0), (3.0, 2.0))])
     motion = np.array([0.3, 0.3, 0.1])
     assert_found(match_polar(scan(walls, STILL), scan(walls, motion), LMS111, STILL), motion, 0.01, 0.15)
+
+
+def test_projection_hides_what_stands_behind_and_what_shows_its_back() -> None:
+    """A laser at x = 2 sees a panel at x = 1 from ahead; from the origin it is seen from its back, before a far wall."""
+    walls = np.vstack([polyline((1.0, -0.5), (1.0, 0.5)), polyline((5.0, -9.0), (5.0, 9.0))])
+    pose, increment = np.array([2.0, 0.3, 0.4]), LMS111[1] - LMS111[0]
+    ranges = filter_ranges(scan(walls, pose))
+    labels = label_surfaces(ranges, increment)
+    projected = _project(ranges, labels, np.cos(LMS111), np.sin(LMS111), increment, pose)
+    behind_panel = np.abs(LMS111) < np.arctan(0.4)
+    beside_panel = (np.abs(LMS111) > np.arctan(0.6)) & (np.abs(LMS111) < np.radians(50))
+    assert (projected[behind_panel] == 0).all()
+    assert_allclose(projected[beside_panel], 5 / np.cos(LMS111[beside_panel]), rtol=1e-9)
 
 
 @pytest.mark.parametrize("empty", [np.inf, np.nan, 0.0, -1.0])
