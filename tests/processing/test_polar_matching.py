@@ -173,12 +173,12 @@ def test_what_hides_behind_a_corner_does_not_pull() -> None:
 def test_projection_hides_what_stands_behind_and_what_shows_its_back() -> None:
     """A laser at x = 2 sees a panel at x = 1 from ahead; the origin looks at its back, before a far wall."""
     walls = np.vstack([polyline((1.0, -0.5), (1.0, 0.5)), polyline((5.0, -9.0), (5.0, 9.0))])
-    pose, increment = np.array([2.0, 0.3, 1.2]), LMS111[1] - LMS111[0]
+    pose, increment = np.array([2.0, 0.3, 1.7]), LMS111[1] - LMS111[0]
     ranges = filter_ranges(scan(walls, pose))
     labels = label_surfaces(ranges, increment)
     projected = _project(ranges, labels, np.cos(LMS111), np.sin(LMS111), increment, pose)
     behind_panel = np.abs(LMS111) < np.arctan(0.4)
-    beside_panel = (np.abs(LMS111) > np.arctan(0.6)) & (np.abs(LMS111) < np.radians(50))
+    beside_panel = (LMS111 > np.arctan(0.6)) & (LMS111 < np.radians(50))
     assert (projected[behind_panel] == 0).all()
     assert_allclose(projected[beside_panel], 5 / np.cos(LMS111[beside_panel]), rtol=1e-9)
 
