@@ -85,7 +85,7 @@ def arc(inputs: Array) -> Array:
 
 
 def input_variances(inputs: Array, noise: OdometryNoise) -> Array:
-    """Variances (n, 3) of distance, turn and slip: in proportion to what was driven, so that two halves make a whole."""
+    """Variances (n, 3) of distance, turn and slip: in proportion to the way, so that two halves make a whole."""
     metres, degrees = np.abs(inputs[:, 0]), np.degrees(np.abs(inputs[:, 1]))
     scrub = noise.position_m_per_sqrt_deg**2 * degrees + STANDING_M**2
     along = noise.distance_m_per_sqrt_m**2 * metres + scrub

@@ -1,0 +1,89 @@
+"""The atlas: the product, as records in memory and as a folder on disk, written whole or not at all.
+
+NAME.atlas/atlas.json                what the graph is made of, and from what
+NAME.atlas/edges/<id>.npz            poses, covariances, links and grid of every piece, in its own frame
+NAME.atlas/trajectories/<run>.tum    t x y z qx qy qz qw of every stamp with odometry or a scan, in the atlas frame
+NAME.atlas/map.pgm, .yaml, .png      the stitched picture: a view of the atlas, not the atlas
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw_profiles.errors import BadInputError
+from processing.map_files import Overlay, write_map
+from processing.occupancy_grid import Grid, stitch
+from processing.tum import write_tum
+
+Array = NDArray[np.float64]
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Atlas:
+    document: dict[str, Any]  # what atlas.json holds
+    edges: dict[str, Mapping[str, NDArray[Any]]]  # by edge id, what its npz holds
+    trajectories: dict[str, tuple[NDArray[np.int64], Array]]  # by run id: stamps [ns], poses (m, 3)
+    grids: list[Grid]  # in the order of the edges
+    frames: Array  # (edges, 3) of the grids in the atlas
+
+
+def refuse_existing(path: Path) -> None:
+    """Raises: BadInputError: the atlas exists already, or its folder does not."""
+    if path.exists():
+        raise BadInputError(f"{path} exists already; it is left as it is")
+    if not path.parent.is_dir():
+        raise BadInputError(f"{path.parent}: no such folder")
+
+
+def write_atlas(path: Path, atlas: Atlas) -> None:
+    """Write the folder beside its place, and move it there when it is whole. Raises: BadInputError: it exists already."""
+    refuse_existing(path)
+    part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        part.chmod(0o755)
+        (part / "edges").mkdir()
+        (part / "trajectories").mkdir()
+        for name, arrays in atlas.edges.items():
+            np.savez_compressed(part / "edges" / f"{name}.npz", allow_pickle=False, **arrays)
+        for run_id, (stamps_ns, poses) in atlas.trajectories.items():
+            write_tum(part / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
+        write_map(part, stitch(atlas.grids, atlas.frames), _overlay(atlas))
+        text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
+        (part / "atlas.json").write_text(text + "\n", encoding="utf-8")
+        os.rename(part, path)  # noqa: PTH104 - Path.rename is the same, but says less clearly that it is atomic
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """What atlas.json holds. Raises: BadInputError: there is no atlas, or one of another schema."""
+    try:
+        document = json.loads((path / "atlas.json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError(f"{path}: no atlas here ({error.strerror or error})") from error
+    except ValueError as error:
+        raise BadInputError(f"{path}/atlas.json: not JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise BadInputError(f"{path}/atlas.json: schema is not {SCHEMA}; another version of rtlog-atlas wrote it")
+    return document
+
+
+def _overlay(atlas: Atlas) -> Overlay:
+    at = np.array([[node["x"], node["y"]] for node in atlas.document["nodes"]]).reshape(-1, 2)
+    ends = [[edge["i"], edge["j"]] for edge in atlas.document["edges"] if edge["j"] is not None]
+    return Overlay(
+        nodes=at,
+        names=[node["epc"][-4:] for node in atlas.document["nodes"]],
+        edges=at[np.array(ends, np.int64).reshape(-1, 2)],
+        trajectories=[poses[:, :2] for _, poses in atlas.trajectories.values()],
+    )

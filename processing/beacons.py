@@ -1,0 +1,62 @@
+"""Beacons: the places on a trajectory where an RFID tag was passed (paper, section 2.2 and figure 5).
+
+Driving by a tag, the vehicle reads it at many poses: the tag's *read cloud*. A pass is one drive past a tag; a later
+pass of the same tag is another cloud. The tag itself is never located: it only says "here".
+
+    pose index   40 41 42 43 44 45 46 47 48        the cloud is 41 42 44 45 47
+    tag read         x  x     x  x     x           its centre is 44, the median of the index range 41 … 47
+                     |<--- 2 range --->|
+
+In: reads of (pose index, EPC), open-loop poses. Out: passes in driving order.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAX_GAP_POSES = 30  # a silence of 3 s at 0.1 s a tick, and
+MAX_GAP_M = 4.0  # of so many metres: a vehicle that stands still under a tag that answers now and then makes one pass
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    epc: str
+    centre: int  # index of the pose in the middle of the read cloud
+    first: int  # indices of the first and the last read
+    last: int
+    x: float  # of the centre [m], in the frame of the poses
+    y: float
+    range_m: float  # how far from the centre the tag was still read; half a chord, so short where the drive turned
+
+
+def find_passes(
+    epcs: NDArray[np.str_],  # (k,)
+    indices: Ints,  # (k,) pose at each read
+    poses: Array,  # (n, 3)
+    max_gap_poses: int = MAX_GAP_POSES,
+    max_gap_m: float = MAX_GAP_M,
+) -> list[Pass]:
+    """Cut each tag's reads into clouds wherever it was silent for too long, and reduce each to its centre and range."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    passes = []
+    for epc in np.unique(epcs).tolist():
+        reads = np.sort(indices[epcs == epc])
+        silent = (np.diff(reads) > max_gap_poses) & (np.diff(travelled[reads]) > max_gap_m)
+        for cloud in np.split(reads, np.flatnonzero(silent) + 1):
+            first, last = int(cloud[0]), int(cloud[-1])
+            centre = (first + last) // 2
+            chord = np.hypot(*(poses[last, :2] - poses[first, :2]))
+            x, y = poses[centre, :2].tolist()
+            passes.append(Pass(epc, centre, first, last, x, y, float(chord / 2)))
+    return sorted(passes, key=lambda found: (found.centre, found.epc))
+
+
+def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:
+    """Neighbouring passes of two different tags whose clouds overlap: both are kept, the operator should know."""
+    pairs = pairwise(passes)
+    return [(a, b) for a, b in pairs if a.epc != b.epc and b.first <= a.last]

@@ -1,0 +1,162 @@
+"""Closed-loop poses of one piece of the map: an edge between two beacons, a spur, or a whole run without tags.
+
+In: paths, each the key frames of one drive through the piece, open loop from its own (0, 0, 0): the weak links. Out:
+poses of all key frames in one frame, with strong links found between them, iterated until links and poses settle
+(paper, section 2.3 and figure 6; Lu & Milios 1997).
+
+The piece grows along the drives: a stretch at a time is added, linked to what is already there, and solved, so that the
+guess for the next links is never worse than one stretch of open loop.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry import accumulate
+from processing.pose_graph import Links, Solution, solve
+from processing.scan_matching import Matcher, Scan
+from processing.strong_links import (
+    HOP_INLIERS,
+    LOOP_INLIERS,
+    LOOP_RADIUS_M,
+    SEARCH_INLIERS,
+    KeyFrames,
+    hop_pairs,
+    loop_pairs,
+    match_pairs,
+)
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STRETCH_M = 15.0
+MAX_ROUNDS = 5
+MAX_DRIFT_M, MAX_DRIFT_RAD = 4.0, 0.6  # beyond, a search finds more wrong places than right ones
+DOUBTED = 0.1  # a strong link of less weight is dropped, and may be found again from better poses
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """One drive through the piece: K key frames."""
+
+    run_id: str
+    keyframes: Ints  # (K,) their numbers in the run
+    scans: list[Scan]
+    chain: Links  # K - 1 weak links, between (0, 1), (1, 2) …
+    start: Array  # (3,) first guess of the first pose in the frame of the piece
+
+
+@dataclass(frozen=True, slots=True)
+class PieceMap:
+    poses: Array  # (N, 3) of all paths' key frames, one path after the other
+    firsts: Ints  # (P + 1,) where each path begins; the last is N
+    links: Links  # weak and strong
+    solution: Solution
+
+    def path(self, p: int) -> slice:
+        return slice(int(self.firsts[p]), int(self.firsts[p + 1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far a drive may have strayed since it was last linked to what was there before: three standard deviations."""
+
+    variance_m2: float = 0.0  # of the links' own position
+    variance_rad2: float = 0.0
+    sway_m: float = 0.0  # what the heading's error makes of the way: it adds up as metres, not as variances
+
+    def after(self, chain: Links) -> "Drift":
+        covariances = np.linalg.inv(chain.informations)
+        turn = self.variance_rad2 + np.cumsum(covariances[:, 2, 2])
+        steps = np.hypot(*chain.motions[:, :2].T)
+        moved = covariances[:, 0, 0].sum() + covariances[:, 1, 1].sum()
+        return Drift(self.variance_m2 + float(moved), float(turn[-1]), self.sway_m + float(steps @ np.sqrt(turn)))
+
+    @property
+    def radius_m(self) -> float:
+        return min(3 * float(np.hypot(self.variance_m2**0.5, self.sway_m)), MAX_DRIFT_M)
+
+    @property
+    def radius_rad(self) -> float:
+        return min(3 * self.variance_rad2**0.5, MAX_DRIFT_RAD)
+
+
+def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
+    """Find strong links and solve until they settle. The first pose of the first path stays where it starts."""
+    frames, chain, firsts = _join(paths, mount, match)
+    poses = np.concatenate([accumulate(path.start, path.chain.motions) for path in paths])
+    links = chain + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
+    loops = links[np.zeros(0, np.int64)]
+    count = len(poses)
+    present = np.zeros(count, bool)
+    for path in range(len(paths)):
+        drift = Drift()
+        for stretch in _stretches(frames, np.arange(firsts[path], firsts[path + 1])):
+            if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
+                onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
+                poses[stretch] = accumulate(poses[stretch[0] - 1], onward.motions)[1:]
+                drift = drift.after(onward)
+            pairs = loop_pairs(frames, poses, stretch, np.flatnonzero(present), LOOP_RADIUS_M + drift.radius_m)
+            found = match_pairs(frames, poses, pairs, LOOP_INLIERS)
+            if len(found) < 0.3 * len(pairs) and drift.radius_m > 0.5:
+                found = match_pairs(frames, poses, pairs[::2], SEARCH_INLIERS, drift.radius_m, drift.radius_rad)
+            present[stretch] = True
+            if len(found) or stretch[0] == firsts[path]:
+                loops = loops + found
+                poses = _solve_present(poses, links + loops, present)
+            if len(found) > 2:
+                drift = Drift()
+    return _settle(frames, links, poses, firsts)
+
+
+def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> PieceMap:
+    """Search all loops anew from the solved poses, until the set of links no longer changes."""
+    everything = np.arange(len(poses))
+    known: set[tuple[int, int]] = set()
+    solution = solve(poses, links)
+    for _ in range(MAX_ROUNDS):
+        pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
+        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+        loops = match_pairs(frames, poses, pairs, LOOP_INLIERS)
+        solution = solve(poses, links + loops)
+        poses = solution.poses
+        kept = {(int(i), int(j)) for i, j in loops.ends}
+        if len(kept ^ known) <= 0.02 * len(kept):
+            break
+        known = kept
+    believed = (links + loops)[np.flatnonzero(solution.weights >= DOUBTED)]
+    solution = solve(poses, believed)
+    return PieceMap(solution.poses, firsts, believed, solution)
+
+
+def _solve_present(poses: Array, links: Links, present: NDArray[np.bool_]) -> Array:
+    """Solve for the key frames that are there already; the others wait."""
+    numbers = np.cumsum(present) - 1
+    inside = present[links.ends].all(axis=1)
+    part = links[inside]
+    part = Links(numbers[part.ends], part.motions, part.informations, part.robust)
+    solved = poses.copy()
+    solved[present] = solve(poses[present], part, max_iterations=10).poses
+    return solved
+
+
+def _join(paths: list[Path], mount: Array, match: Matcher) -> tuple[KeyFrames, Links, Ints]:
+    firsts = np.cumsum([0] + [len(path.scans) for path in paths])
+    chain = paths[0].chain
+    for path, first in zip(paths[1:], firsts[1:], strict=False):
+        chain = chain + path.chain.shifted(int(first))
+    travelled = [np.append(0.0, np.cumsum(np.hypot(*path.chain.motions[:, :2].T))) for path in paths]
+    frames = KeyFrames(
+        scans=[scan for path in paths for scan in path.scans],
+        drive=np.repeat(np.arange(len(paths)), np.diff(firsts)),
+        travelled=np.concatenate(travelled),
+        mount=mount,
+        match=match,
+    )
+    return frames, chain, firsts
+
+
+def _stretches(frames: KeyFrames, members: Ints) -> list[Ints]:
+    bins = (frames.travelled[members] // STRETCH_M).astype(int)
+    return np.split(members, np.flatnonzero(np.diff(bins)) + 1)

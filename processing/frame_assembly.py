@@ -1,0 +1,178 @@
+"""Assembly beyond the paper: pieces as relative poses of their boundary, with full covariance, in one small pose graph.
+
+In: each piece, solved by itself in its own frame. Out: the poses of its boundary, the passes of tags above all, in
+one frame.
+
+    piece A  ●━━━━━━━━━●              ● boundary: a pass belongs to the piece before it and to the piece after it, and
+                       ●━━━━━━● B     joins them rigidly; the rest of a piece is eliminated exactly (Schur complement),
+           pass shared by A and B     so what is left is small, and to solve it is to solve the whole network
+
+Where pieces overlap without sharing a pass (two passes of one tag in different pieces, two edges before the same
+junction), links between their key frames join them; those key frames then belong to the boundary too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from processing.geometry import compose, inverse, relative, relative_jacobians, wrap_angle
+from processing.pose_graph import CORNER, Links, boundary_information, factorise, residuals, robust_weights
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Condensed:
+    """What one piece knows of the relative poses of its boundary: b variables of the assembly."""
+
+    variables: Ints  # (b,)
+    local: Array  # (b, 3) in the frame of the piece
+    root: Array  # (3b - 3, 3b - 3) R: |R · error|² is the cost of the errors of poses 1 … b-1 seen from pose 0
+
+
+def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variables: Ints) -> Condensed:
+    """Eliminate all poses (N, 3) of a solved piece but the boundary's."""
+    local = poses[boundary]
+    if len(boundary) < 2:
+        return Condensed(variables, local, np.zeros((0, 0)))
+    information = boundary_information(poses, links, weights, boundary)[3:, 3:]  # with the first pose held
+    _, j_b = relative_jacobians(np.broadcast_to(local[0], local[1:].shape), local[1:])
+    turn = sp.block_diag(np.linalg.inv(j_b)).toarray()
+    seen = turn.T @ information @ turn
+    values, vectors = np.linalg.eigh((seen + seen.T) / 2)
+    return Condensed(variables, local, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+
+
+def solve_frames(
+    first_guess: Array, pieces: list[Condensed], links: Links, fixed: NDArray[np.bool_], max_iterations: int = 50
+) -> tuple[Array, Array]:
+    """Poses (V, 3) of all variables, and the weight (m,) of each link between pieces. Damped Gauss–Newton.
+
+    `fixed` (V,): one variable of each connected part, at least.
+    """
+    poses = first_guess.copy()
+    free = np.flatnonzero(np.repeat(~fixed, 3))
+    cost, damping = _cost(poses, pieces, links), 0.0
+    for _ in range(max_iterations):
+        jacobian, error = _linearise(poses, pieces, links)
+        jacobian = jacobian[:, free]
+        normal = (jacobian.T @ jacobian).tocsc()
+        normal = normal + damping * sp.diags(normal.diagonal()).tocsc()
+        tried = poses.copy()
+        tried.reshape(-1)[free] -= factorise(normal.tocsc()).solve(jacobian.T @ error)
+        tried[:, 2] = wrap_angle(tried[:, 2])
+        tried_cost = _cost(tried, pieces, links)
+        if tried_cost <= cost * (1 + 1e-9) + 1e-12:
+            settled = np.abs(relative(poses, tried)).max() < 1e-6
+            poses, cost, damping = tried, tried_cost, damping / 10
+            if settled:
+                break
+        else:
+            damping = max(10 * damping, 1e-6)
+            if damping > 1e6:
+                break
+    return poses, robust_weights(_squares(poses, links), links.robust, CORNER)
+
+
+def _squares(poses: Array, links: Links) -> Array:
+    error = residuals(poses, links)
+    return np.asarray(np.einsum("mi,mij,mj->m", error, links.informations, error))
+
+
+def _piece_error(poses: Array, piece: Condensed) -> Array:
+    there, here = poses[piece.variables], piece.local
+    error = relative(there[0], there[1:]) - relative(here[0], here[1:])
+    error[:, 2] = wrap_angle(error[:, 2])
+    return np.asarray(piece.root @ error.ravel())
+
+
+def _cost(poses: Array, pieces: list[Condensed], links: Links) -> float:
+    squares = _squares(poses, links)
+    robust = np.where(links.robust, CORNER * squares / (CORNER + squares), squares).sum()
+    return float(
+        robust + sum(np.square(_piece_error(poses, piece)).sum() for piece in pieces if len(piece.variables) > 1)
+    )
+
+
+def _linearise(poses: Array, pieces: list[Condensed], links: Links) -> tuple[sp.csc_matrix, Array]:
+    """The whitened errors and their sparse Jacobian over all variables."""
+    rows, columns, values, errors, height = [], [], [], [], 0
+
+    def add(block: Array, variable: int) -> None:
+        r, c = np.indices(block.shape)
+        rows.append(height + r.ravel())
+        columns.append(3 * variable + c.ravel())
+        values.append(block.ravel())
+
+    for piece in pieces:
+        if len(piece.variables) < 2:
+            continue
+        there = poses[piece.variables]
+        j_a, j_b = relative_jacobians(np.broadcast_to(there[0], there[1:].shape), there[1:])
+        add(piece.root @ j_a.reshape(-1, 3), piece.variables[0])
+        for k, block in enumerate(j_b):
+            add(piece.root[:, 3 * k : 3 * k + 3] @ block, piece.variables[k + 1])
+        errors.append(_piece_error(poses, piece))
+        height += len(errors[-1])
+    if len(links):
+        weights = robust_weights(_squares(poses, links), links.robust, CORNER)
+        roots = np.sqrt(weights)[:, None, None] * np.swapaxes(np.linalg.cholesky(links.informations), 1, 2)
+        j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
+        error = residuals(poses, links)
+        for k, (a, b) in enumerate(links.ends):
+            add(roots[k] @ j_a[k], a)
+            add(roots[k] @ j_b[k], b)
+            errors.append(roots[k] @ error[k])
+            height += 3
+    shape = (height, 3 * len(poses))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csc_matrix(entries, shape=shape), np.concatenate(errors)
+
+
+def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Array, Ints, list[Array]]:
+    """A first guess by a spanning tree over pieces and links.
+
+    Returns: poses (V, 3), the connected part of each (V,), and each piece's frame (3,).
+
+    Every part begins at the frame of its first piece.
+    """
+    poses, part = np.zeros((variables, 3)), np.full(variables, -1)
+    frames: list[Array | None] = [None] * len(pieces)
+    members: list[list[int]] = [[] for _ in range(variables)]
+    for p, piece in enumerate(pieces):
+        for v in piece.variables:
+            members[v].append(p)
+    joined: list[list[tuple[int, Array]]] = [[] for _ in range(variables)]
+    for (a, b), motion in zip(links.ends, links.motions, strict=True):
+        joined[a].append((int(b), motion))
+        joined[b].append((int(a), inverse(motion)))
+    parts = 0
+    for root in range(len(pieces)):
+        if frames[root] is not None:
+            continue
+        frames[root], waiting = np.zeros(3), [root]
+        while waiting:
+            p = waiting.pop(0)
+            frame = frames[p]
+            assert frame is not None
+            placed = [
+                (int(v), compose(frame, at))
+                for v, at in zip(pieces[p].variables, pieces[p].local, strict=True)
+                if part[v] < 0
+            ]
+            while placed:
+                v, pose = placed.pop(0)
+                if part[v] >= 0:
+                    continue
+                poses[v], part[v] = pose, parts
+                placed += [(other, compose(pose, motion)) for other, motion in joined[v] if part[other] < 0]
+                for q in members[v]:
+                    if frames[q] is None:
+                        at = pieces[q].local[np.flatnonzero(pieces[q].variables == v)[0]]
+                        frames[q] = compose(pose, inverse(at))
+                        waiting.append(q)
+        parts += 1
+    return poses, part, [frame for frame in frames if frame is not None]

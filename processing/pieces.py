@@ -1,0 +1,128 @@
+"""The pieces of the map between the stages: what a run gives to a piece, and what comes back when it is solved.
+
+In: open-loop runs and the graph. Out: solved pieces, each with its poses, its grid and where its passes are. A piece is
+computed from its own arrays alone, so pieces can be solved in any order and anywhere.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.edge_map import Path, PieceMap, map_piece
+from processing.geometry import compose
+from processing.graph import Piece, Span
+from processing.occupancy_grid import Grid, build_grid
+from processing.open_loop import OpenLoop
+from processing.pose_graph import solve
+from processing.registration import path_starts
+from processing.scan_matching import Matcher, Scan
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GRID_SPACING_M = 0.15  # scans closer to each other than this add nothing to a grid
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The scans of a span that go into the grid: s of B beams, seen from key frames of their path."""
+
+    ranges: NDArray[np.float32]  # (s, B) m; +inf no return, NaN invalid
+    angles: NDArray[np.float32]  # (s, B) rad, the motion of the sweep removed
+    keyframe: Ints  # (s,) of the path
+    offsets: Array  # (s, 3) of the vehicle, in the frame of that key frame
+
+
+@dataclass(frozen=True, slots=True)
+class PieceInput:
+    name: str
+    piece: Piece
+    paths: tuple[Path, ...]
+    sights: tuple[Sight, ...]
+    mount: Array  # (3,)
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedPiece:
+    input: PieceInput
+    map: PieceMap
+
+    @property
+    def scans(self) -> list[Scan]:
+        """N, of all paths' key frames."""
+        return [scan for path in self.input.paths for scan in path.scans]
+
+    def ends(self, p: int) -> tuple[int, int]:
+        """Indices of the first and last pose of path `p`."""
+        return int(self.map.firsts[p]), int(self.map.firsts[p + 1]) - 1
+
+
+def cut_span(run_id: str, loop: OpenLoop, ranges: NDArray[np.float32], angles: Array, span: Span) -> tuple[Path, Sight]:
+    """What one span gives to its piece; the passes at its ends are key frames."""
+    a, b = (int(np.searchsorted(loop.keyframes, scan)) for scan in (span.first, span.last))
+    chain = loop.links[np.arange(a, b)].shifted(-a)
+    path = Path(run_id, np.arange(a, b + 1), loop.scans[a : b + 1], chain, np.zeros(3))
+    scans = np.arange(span.first, span.last + 1)
+    travelled = np.append(0.0, np.cumsum(np.hypot(*loop.odometry.deltas[span.first : span.last, :2].T)))
+    shown = scans[np.unique(np.floor(travelled / GRID_SPACING_M), return_index=True)[1]]
+    points = loop.points[shown]
+    straightened = np.hypot(points[..., 0], points[..., 1])
+    bearing = np.arctan2(points[..., 1], points[..., 0])
+    returned = np.isfinite(straightened)
+    keyframe = np.clip(loop.reference[shown] - a, 0, b - a)
+    sight = Sight(
+        ranges=np.where(returned, straightened, np.where(np.isinf(ranges[shown]), np.inf, np.nan)).astype(np.float32),
+        angles=np.where(returned, bearing, angles).astype(np.float32),
+        keyframe=keyframe,
+        offsets=loop.offsets[shown],
+    )
+    return path, sight
+
+
+def split_drifts(given: PieceInput) -> list[PieceInput]:
+    """Register the paths of a piece to each other; two drifts between the same two tags become two pieces."""
+    starts, groups = path_starts(
+        chains=[path.chain for path in given.paths],
+        scans=[path.scans for path in given.paths],
+        ends=[(span.start, span.end) for span in given.piece.spans],
+        mount=given.mount,
+        same_drift=given.piece.j is not None,
+    )
+    out = []
+    for number, leader in enumerate(dict.fromkeys(groups)):
+        chosen = [p for p, group in enumerate(groups) if group == leader]
+        out.append(
+            PieceInput(
+                given.name + ("" if number == 0 else "bcdefghijklmnopqrstuvwxyz"[min(number - 1, 24)]),
+                replace(given.piece, spans=tuple(given.piece.spans[p] for p in chosen)),
+                tuple(replace(given.paths[p], start=starts[p]) for p in chosen),
+                tuple(given.sights[p] for p in chosen),
+                given.mount,
+            )
+        )
+    return out
+
+
+def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:
+    return [SolvedPiece(part, map_piece(list(part.paths), part.mount, match)) for part in split_drifts(given)]
+
+
+def bend_to(solved: SolvedPiece, boundary: Ints, boundary_poses: Array, first_guess: Array) -> SolvedPiece:
+    """Solve a piece again with its boundary where the assembly has put it; the piece comes out in the atlas frame."""
+    poses = first_guess.copy()
+    poses[boundary] = boundary_poses
+    fixed = np.zeros(len(poses), bool)
+    fixed[boundary] = True
+    solution = solve(poses, solved.map.links, fixed)
+    return SolvedPiece(solved.input, replace(solved.map, poses=solution.poses, solution=solution))
+
+
+def draw_piece(given: PieceInput, firsts: Ints, poses: Array, resolution_m: float) -> Grid:
+    """The occupancy grid of a piece, in the frame of the key frames' poses (N, 3)."""
+    laser, ranges, angles = [], [], []
+    for p, sight in enumerate(given.sights):
+        laser.append(compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), given.mount))
+        ranges.append(sight.ranges)
+        angles.append(sight.angles)
+    return build_grid(np.concatenate(laser), np.concatenate(ranges), np.concatenate(angles), resolution_m)

@@ -1,0 +1,137 @@
+"""The whole method in one screen: recordings in, atlas out.
+
+recordings ─ read_log ─ open_loop ─ beacons ─┐
+                                             graph ─ pieces (edge_map) ─ assembly ─ grids ─ Atlas
+"""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from hw_profiles.errors import BadInputError
+from hw_profiles.profile import Profile
+from processing.atlas import Atlas
+from processing.atlas_document import assemble_atlas
+from processing.beacons import Pass, find_passes, overlapping_passes
+from processing.edge_placement import Placed, Placement, place_by_frames
+from processing.graph import Piece, build_graph
+from processing.occupancy_grid import Grid
+from processing.odometry import dead_reckon
+from processing.open_loop import OpenLoop, estimate_open_loop, mount_pose, odometry_at_scans
+from processing.pieces import PieceInput, cut_span, draw_piece, solve_piece
+from processing.read_log import Run, read_log
+from processing.scan_matching import Matcher, match_scans
+
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans}
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What `rtlog-atlas build` was asked for; it goes into the atlas, so that a result explains itself."""
+
+    method: Literal["landmark", "global"] = "landmark"
+    assembly: Literal["refined", "paper"] = "refined"
+    matcher: Literal["point-to-line", "psm"] = "point-to-line"
+    resolution_m: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenRun:
+    run: Run
+    loop: OpenLoop
+    passes: list[Pass]
+
+
+def build(recordings: list[Path], profile: Profile | None, config: Config, jobs: int = 1) -> Atlas:
+    """Map recordings. Raises: BadInputError: a recording is unfit, or two of them are the same run."""
+    match = MATCHERS[config.matcher]
+    work = Workers(jobs)
+    runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
+    _refuse_twins(runs, recordings)
+    graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
+    inputs = [piece_input(piece, runs) for piece in graph.pieces]
+    solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
+    placed = place_by_frames(solved, graph, match)
+    grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
+    return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed))
+
+
+def drive_through(recording: Path, profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
+    """Read one recording, find its passes and estimate it open loop."""
+    run = read_log(recording, profile)
+    driven = dead_reckon(odometry_at_scans(run))
+    passes: list[Pass] = []
+    if config.method == "landmark" and len(run.tags.epcs):
+        nearest = np.searchsorted((run.scans.times[1:] + run.scans.times[:-1]) / 2, run.tags.times)
+        passes = find_passes(run.tags.epcs, nearest, driven)
+    loop = estimate_open_loop(run, np.array([found.centre for found in passes], np.int64), match)
+    return DrivenRun(run, loop, passes)
+
+
+def piece_input(piece: Piece, runs: list[DrivenRun]) -> PieceInput:
+    cuts = [
+        cut_span(
+            runs[s.run].run.run_id, runs[s.run].loop, runs[s.run].run.scans.ranges, runs[s.run].run.scans.angles, s
+        )
+        for s in piece.spans
+    ]
+    if piece.j is not None:
+        name = f"{piece.i}-{piece.j}"
+    else:
+        name = f"{piece.i}-spurs" if piece.i is not None else f"run-{piece.spans[0].run}"
+    paths, sights = (tuple(column) for column in zip(*cuts, strict=True))
+    return PieceInput(name, piece, paths, sights, mount_pose(runs[piece.spans[0].run].run))
+
+
+def draw_placed(placed: Placed, resolution_m: float) -> Grid:
+    return draw_piece(placed.solved.input, placed.solved.map.firsts, placed.edge_poses, resolution_m)
+
+
+def remarks(runs: list[DrivenRun], placed: Placement) -> list[str]:
+    """What the user should know about this atlas, a line each."""
+    out = []
+    for driven in runs:
+        tags = len({found.epc for found in driven.passes})
+        if tags < 2:
+            out.append(f"run {driven.run.run_id} passed {tags} tag{'s' * (tags != 1)}: it is mapped alone")
+        for a, b in overlapping_passes(driven.passes):
+            out.append(f"run {driven.run.run_id}: the read clouds of {a.epc} and {b.epc} overlap")
+        lost = int((~driven.loop.matched[1:]).sum())
+        if lost:
+            out.append(f"run {driven.run.run_id}: {lost} of {len(driven.loop.matched)} scans follow odometry alone")
+    return out + placed.remarks
+
+
+def _refuse_twins(runs: list[DrivenRun], recordings: list[Path]) -> None:
+    seen: dict[str, Path] = {}
+    for driven, path in zip(runs, recordings, strict=True):
+        twin = seen.setdefault(driven.run.run_id, path)
+        if twin is not path:
+            raise BadInputError(f"{path} and {twin} are the same run {driven.run.run_id}")
+
+
+class Workers:
+    """Work on independent items, here or in `jobs` processes; the results do not depend on where."""
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+
+    def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        items = list(items)
+        bar = partial(tqdm, total=len(items), desc=label, disable=None, leave=False)
+        if self.jobs == 1 or len(items) < 2:
+            return [function(item) for item in bar(items)]
+        with ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool:
+            return list(bar(pool.map(function, items)))

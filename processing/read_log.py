@@ -1,0 +1,224 @@
+"""Recording → arrays: SI, radians, one clock. The door of `processing`: what is wrong with a file is said here.
+
+In: an MCAP recording, ours or another system's (`/scan` for the primary laser, `/odom` for encoders, any beam count,
+stamps that jitter or run backwards now and then). Out: a `Run`. Stamps are header stamps: nanoseconds UTC of the
+measurement itself, kept as they are for the output. Times, in seconds since `epoch_ns`, are what the stages reckon
+with: they rise from message to message in the order of the recording, because where stamps run backwards it is the
+order that is true.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw_profiles.errors import BadInputError
+from hw_profiles.profile import Profile, parse_profile
+from rtlog_client.log_file import LogInfo, read_info, read_messages
+from rtlog_server.messages import decode, to_ns
+from rtlog_server.topics import JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+SCAN_TOPICS = (PRIMARY_SCAN.name, "/scan")
+BARE_PROFILE = Profile(schema=1, name="scanner at the vehicle's origin")
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """n scans of B beams each in the scanner's frame; shorter scans are padded with NaN."""
+
+    stamps_ns: Stamps  # (n,) of the first ray
+    times: Array  # (n,) s, strictly rising
+    ranges: NDArray[np.float32]  # (n, B) m; +inf no return, NaN invalid
+    angle_min: float
+    angle_increment: float
+    time_increment_s: float  # between two beams of a sweep
+
+    @property
+    def angles(self) -> Array:
+        """(B,) rad, counter-clockwise."""
+        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class TagReadings:
+    """k reads in order of time."""
+
+    times: Array  # (k,) s
+    epcs: NDArray[np.str_]  # (k,)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    run_id: str
+    sha256: str
+    profile: Profile
+    scans: Scans
+    scan_ticks: NDArray[
+        np.int64
+    ]  # (n,) the tick of each scan, counted from the recording's first; its own number without ticks
+    epoch_ns: int  # where times count from
+    motion_ns: Stamps  # (m,) stamps of the encoders or of /odom
+    motion_times: Array  # (m,) s, strictly rising
+    wheels: Array | None  # (m, 2) rad, in the order of the kinematics' ROLES; or
+    odometry: Array | None  # (m, 3) poses of /odom, where that stands in for encoders
+    tags: TagReadings
+    ticks: int
+
+
+def read_log(path: Path, profile: Profile | None = None) -> Run:
+    """Read a recording; `profile` stands in for a missing attachment.
+
+    Raises:
+        BadInputError: no recording, no laser in it, no odometry in it, or no profile for its encoders.
+    """
+    info = read_info(path)
+    profile = _profile(path, info, profile)
+    scan_topic = next((topic for topic in SCAN_TOPICS if info.message_counts.get(topic)), None)
+    if scan_topic is None:
+        raise BadInputError(f"{path}: no laser scans ({' or '.join(SCAN_TOPICS)}); there is nothing to map")
+    encoder_topic = next((t for t in (JOINT_STATES.name, ODOMETRY.name) if info.message_counts.get(t)), None)
+    if encoder_topic is None:
+        raise BadInputError(f"{path}: neither {JOINT_STATES.name} nor {ODOMETRY.name}; the motion is unknown")
+    if encoder_topic == JOINT_STATES.name and not profile.encoders:
+        raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
+    scans: list[Any] = []
+    motions: list[tuple[int, Any]] = []
+    reads: list[tuple[int, str]] = []
+    wheels = _wheels_of(profile) if encoder_topic == JOINT_STATES.name else _pose_of
+    tick_log_times: list[int] = []
+    scan_log_times: list[int] = []
+    for topic, log_time_ns, message in _decoded(path, [TICK.name, scan_topic, encoder_topic, TAGS.name]):
+        if topic == TICK.name:
+            tick_log_times.append(log_time_ns)
+        elif topic == scan_topic:
+            scans.append(message)
+            scan_log_times.append(log_time_ns)
+        elif topic == encoder_topic:
+            value = wheels(message)
+            if value is not None:
+                motions.append((to_ns(message.header.stamp), value))
+        else:
+            reads.extend((to_ns(read.stamp), str(read.epc).upper()) for read in message.reads)
+    if not motions:
+        roles = [encoder.name for encoder in profile.encoders]
+        raise BadInputError(f"{path}: no message on {encoder_topic} holds a reading of {' and '.join(roles)}")
+    reads.sort()
+    motion_ns = np.array([ns for ns, _ in motions], np.int64)
+    motion = np.array([value for _, value in motions], np.float64)
+    scan_ns = np.array([to_ns(scan.header.stamp) for scan in scans], np.int64)
+    epoch_ns = int(min(motion_ns.min(), scan_ns.min()))
+    motion_times = rising_times(motion_ns, epoch_ns)
+    scan_times = rising_times(scan_ns, epoch_ns)
+    _take_over_times(scan_ns, scan_times, motion_ns, motion_times)
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    have_wheels = encoder_topic == JOINT_STATES.name
+    return Run(
+        run_id=info.run_id,
+        sha256=sha256,
+        profile=profile,
+        scans=_stack_scans(path, scans, scan_ns, scan_times),
+        scan_ticks=(
+            np.searchsorted(tick_log_times, scan_log_times, side="right") - 1
+            if tick_log_times
+            else np.arange(len(scans))
+        ),
+        epoch_ns=epoch_ns,
+        motion_ns=motion_ns,
+        motion_times=motion_times,
+        wheels=motion if have_wheels else None,
+        odometry=None if have_wheels else motion,
+        tags=TagReadings(
+            np.array([(ns - epoch_ns) * 1e-9 for ns, _ in reads], np.float64),
+            np.array([epc for _, epc in reads], np.str_),
+        ),
+        ticks=info.message_counts.get(TICK.name, len(scans)),
+    )
+
+
+def rising_times(stamps_ns: Stamps, epoch_ns: int) -> Array:
+    """Seconds since the epoch, strictly rising: a stamp that runs backwards comes a microsecond after the one before
+    it.
+    """
+    steps = np.arange(len(stamps_ns)) * 1_000
+    return np.asarray(np.maximum.accumulate(stamps_ns - epoch_ns - steps) + steps, np.float64) * 1e-9
+
+
+def _take_over_times(scan_ns: Stamps, scan_times: Array, motion_ns: Stamps, motion_times: Array) -> None:
+    """A scan with the very stamp of an odometry message belongs to that message, whatever backward stamps did to
+    either.
+    """
+    order = np.argsort(motion_ns, kind="stable")
+    at = np.minimum(np.searchsorted(motion_ns[order], scan_ns), len(order) - 1)
+    same = motion_ns[order[at]] == scan_ns
+    scan_times[same] = motion_times[order[at[same]]]
+    steps = np.arange(len(scan_ns)) * 1e-9
+    scan_times[:] = np.maximum.accumulate(scan_times - steps) + steps
+
+
+def _profile(path: Path, info: LogInfo, fallback: Profile | None) -> Profile:
+    """A profile named by the user wins over the one inside: they name it because that one is wrong or missing."""
+    if fallback is not None:
+        return fallback
+    if info.profile_toml is not None:
+        return parse_profile(info.profile_toml, source=f"inside {path}")
+    return BARE_PROFILE
+
+
+def _decoded(path: Path, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
+    for message in read_messages(path, topics):
+        try:
+            inside = None if message.topic == TICK.name else decode(message.data, message.msgtype)
+            yield message.topic, message.log_time_ns, inside
+        except (ValueError, KeyError) as error:
+            raise BadInputError(f"{path}: {message.topic} at {message.log_time_ns} ns: {error}") from error
+
+
+def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:
+    """Reads both encoders of a JointState in the order of their roles; None where one is missing."""
+    roles = {"differential": ("left_wheel", "right_wheel"), "tricycle": ("drive_wheel", "steering")}
+    assert profile.vehicle is not None  # a profile with encoders was checked to have one
+    first, second = (profile.encoder(role).name for role in roles[profile.vehicle.kinematics])
+
+    def read(message: Any) -> tuple[float, float] | None:
+        names = list(message.name)
+        if first not in names or second not in names:
+            return None
+        return float(message.position[names.index(first)]), float(message.position[names.index(second)])
+
+    return read
+
+
+def _pose_of(message: Any) -> tuple[float, float, float]:
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    return position.x, position.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
+
+
+def _stack_scans(path: Path, messages: list[Any], stamps_ns: Stamps, times: Array) -> Scans:
+    increments = {round(float(m.angle_increment), 7) for m in messages}
+    starts = {round(float(m.angle_min), 5) for m in messages}
+    if len(increments) > 1 or len(starts) > 1:
+        raise BadInputError(f"{path}: the scanner's angles change within the recording; record each setting by itself")
+    if not abs(increments.copy().pop()) > 1e-5:
+        raise BadInputError(f"{path}: the scans have an angle_increment of zero")
+    beams = max(len(m.ranges) for m in messages)
+    if beams < 10:
+        raise BadInputError(f"{path}: scans of {beams} beams cannot be matched")
+    ranges = np.full((len(messages), beams), np.nan, np.float32)
+    for row, message in zip(ranges, messages, strict=True):
+        row[: len(message.ranges)] = message.ranges
+        if message.range_max > 0:
+            row[row >= message.range_max] = np.inf
+    last = messages[-1]
+    increment, start, time_increment = float(last.angle_increment), float(last.angle_min), float(last.time_increment)
+    if increment < 0:  # a scanner mounted upside down, or a driver that counts clockwise
+        ranges, start, increment = ranges[:, ::-1], start + increment * (beams - 1), -increment
+        time_increment = -time_increment  # the first ray is now the last beam
+    return Scans(stamps_ns, times, ranges, start, increment, time_increment)

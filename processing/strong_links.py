@@ -1,0 +1,121 @@
+"""Strong links: which pairs of poses that are not neighbours saw the same walls, and what their scans say (paper, 2.1).
+
+In: key frames with their scans and the poses so far. Out: links. Two kinds of pairs are tried:
+
+    hops     ●──●──●──●──●      along one drive, over 2, 4 and 8 m: they stiffen the chain
+             └─────┴─────┘
+    loops    ●──●──●──●──●      between drives, or a drive and its own past, within Δr_max of each other, in either
+               └──┐ └┐          direction: a 270° scanner sees 180° in common when a drift is driven both ways
+              ●──●──●──●
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from processing.geometry import compose, inverse, relative
+from processing.pose_graph import Links
+from processing.scan_match import ScanMatch, through_mount
+from processing.scan_matching import Matcher, Scan, search_match
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+HOPS_M = (2.0, 4.0, 8.0)
+HOP_INLIERS = 0.15
+LOOP_RADIUS_M = 2.5  # Δr_max
+LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
+LOOP_INLIERS = 0.35
+SEARCH_INLIERS = 0.6  # a match that had to be searched for must be a better one
+MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
+
+
+@dataclass(frozen=True, slots=True)
+class KeyFrames:
+    """N key frames of one or more drives over the same ground."""
+
+    scans: list[Scan]
+    drive: Ints  # (N,) which drive each belongs to
+    travelled: Array  # (N,) m since the start of its drive
+    mount: Array  # (3,) scanner in the vehicle
+    match: Matcher
+
+
+def hop_pairs(frames: KeyFrames) -> Ints:
+    """Pairs (p, 2) along each drive, one for each of HOPS_M and key frame."""
+    pairs = []
+    for drive in np.unique(frames.drive):
+        members = np.flatnonzero(frames.drive == drive)
+        way = frames.travelled[members]
+        for hop in HOPS_M:
+            ends = np.searchsorted(way, way + hop)
+            valid = (ends < len(members)) & (ends > np.arange(len(members)) + 1)
+            pairs.append(np.column_stack([members[valid], members[np.minimum(ends, len(members) - 1)[valid]]]))
+    return np.unique(np.concatenate(pairs), axis=0) if pairs else np.empty((0, 2), np.int64)
+
+
+def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: float) -> Ints:
+    """Pairs (p, 2) of a new key frame and the nearest old one on every stretch of drive within the radius."""
+    if len(old) == 0 or len(new) == 0:
+        return np.empty((0, 2), np.int64)
+    tree = cKDTree(poses[old, :2])
+    pairs = []
+    for i, near in zip(new, tree.query_ball_point(poses[new, :2], radius_m), strict=True):
+        candidates = old[np.array(sorted(near), np.int64)]
+        same = frames.drive[candidates] == frames.drive[i]
+        apart = np.abs(frames.travelled[candidates] - frames.travelled[i]) > LOOP_SPACING_M
+        candidates = candidates[(~same | apart) & (candidates != i)]
+        if len(candidates) == 0:
+            continue
+        breaks = (np.diff(candidates) > 3) | (np.diff(frames.drive[candidates]) != 0)
+        for stretch in np.split(candidates, np.flatnonzero(breaks) + 1):
+            pairs.append((nearest(poses, stretch, i), i))
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def nearest(poses: Array, candidates: Ints, i: int) -> int:
+    return int(candidates[np.argmin(np.hypot(*(poses[candidates, :2] - poses[i, :2]).T))])
+
+
+def match_vehicles(
+    reference: Scan,
+    current: Scan,
+    guess: Array,
+    mount: Array,
+    match: Matcher,
+    radius_m: float = 0.0,
+    radius_rad: float = 0.0,
+) -> ScanMatch:
+    """Match two scans; guess and result are motions of the vehicle. With a radius, search around the guess."""
+    scanner_guess = compose(inverse(mount), compose(guess, mount))
+    if radius_m > 0:
+        found = search_match(reference, current, scanner_guess, radius_m, radius_rad)
+    else:
+        found = match(reference, current, scanner_guess)
+    motion, covariance = through_mount(mount, found.motion, found.covariance)
+    return ScanMatch(motion, covariance, found.inliers, found.residual_m, found.converged)
+
+
+def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
+    """Do the scans match well, and say something?"""
+    seen = np.linalg.eigvalsh(found.covariance[:2, :2])[0] < MAX_SIGMA_M**2
+    return bool(found.converged and found.inliers >= min_inliers and seen)
+
+
+def match_pairs(
+    frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float, radius_m: float = 0.0, radius_rad: float = 0.0
+) -> Links:
+    """The links that come of the pairs (p, 2): those whose scans match well and say something."""
+    ends, motions, informations = [], [], []
+    for i, j in pairs:
+        guess = relative(poses[i], poses[j])
+        reference, current = frames.scans[i], frames.scans[j]
+        found = match_vehicles(reference, current, guess, frames.mount, frames.match, radius_m, radius_rad)
+        if not worth_a_link(found, min_inliers):
+            continue
+        ends.append((i, j))
+        motions.append(found.motion)
+        informations.append(np.linalg.inv(found.covariance))
+    return Links.of(np.array(ends, np.int64), np.array(motions), np.array(informations), robust=True)
