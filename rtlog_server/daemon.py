@@ -32,7 +32,7 @@ from rtlog_server.ticker import Lateness, aligned_grid, ticks, utc_offset_ns
 
 log = logging.getLogger(__name__)
 
-QUEUE_TICKS = 300  # 30 s, some 2 MB: longer than a publishing process ever stood still and was well again
+QUEUE_TICKS = 300  # 30 s, some 2 MB
 COLLECT_TICKS = 100  # a garbage collection after every so many ticks; below a millisecond once all is frozen
 CLOSE_DEVICES_S = 0.5
 CLOSE_PUBLISHER_S = 5.0

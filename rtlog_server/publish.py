@@ -14,6 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
@@ -39,7 +40,7 @@ def publish_bundles(connection: Connection, info: ServerInfo) -> None:
     """
     try:
         with Publisher(info) as publisher:
-            connection.send("")
+            _tell(connection, "")
             next_beat = time.monotonic()
             while True:
                 if connection.poll(max(0.0, next_beat - time.monotonic())):
@@ -50,7 +51,12 @@ def publish_bundles(connection: Connection, info: ServerInfo) -> None:
     except (EOFError, ConnectionResetError):
         return  # the sampling process has ended, and all that it sent is out
     except zenoh.ZError as error:
-        connection.send(f"zenoh on {', '.join(info.listen)}: {error}")
+        _tell(connection, f"zenoh on {', '.join(info.listen)}: {error}")
+
+
+def _tell(connection: Connection, line: str) -> None:
+    with suppress(BrokenPipeError):  # the sampling process has ended; what it sent before is still to be published
+        connection.send(line)
 
 
 def server_config(listen: tuple[str, ...]) -> zenoh.Config:

@@ -66,6 +66,17 @@ def test_check_names_every_device_that_is_away(absent_profile: Path) -> None:
     assert "ping 127.0.0.1" in rows[2]
 
 
+def test_a_signal_before_the_publisher_is_up_ends_it_cleanly(absent_profile: Path) -> None:
+    command = [*COMMAND, "run", "--profile", str(absent_profile)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines = [next(line for line in process.stderr if "real time" in line)]
+        process.terminate()
+        lines += process.stderr.readlines()
+        assert process.wait(timeout=10) == 0
+    assert not [line for line in lines if "Traceback" in line or "publishing" in line]
+
+
 def test_a_taken_port_is_one_line(absent_profile: Path) -> None:
     with socket.socket() as holder:
         holder.bind(("127.0.0.1", 0))
