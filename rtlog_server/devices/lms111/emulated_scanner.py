@@ -1,8 +1,8 @@
 """What an LMS111 knows and does: commands → replies, sweeps → LMDscandata. No I/O, no clock of its own.
 
-In: commands, and sweeps in SI units, the scanner's frame and host time, as a LaserScan has them. Out: replies and
-`ScanData` as the device would send them; all times are given by the caller (monotonic ns). The law: without power it
-forgets its configuration, its counters and its clock; without a login it changes nothing; only measuring it has scans.
+In: commands, and sweeps in the scanner's frame and host time, as a LaserScan has them. Out: replies and `ScanData`, as
+the device would send them; all times are given by the caller (monotonic ns). The law: without power it forgets its
+configuration, its counters and its clock; without a login it changes nothing; only measuring it has scans.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rtlog_server.clock import WRAP_US
 from rtlog_server.devices.lms111.protocol import (
@@ -41,6 +41,9 @@ from rtlog_server.devices.lms111.sweep import (
 REJECTED = 3  # the code that real devices send where neighbours vanish
 PAIRS = ((2500, 2500), (5000, 5000))  # scan frequency 1/100 Hz and resolution 1/10000° that go together
 SHOTS_PER_SECOND = 36_000  # at 50 Hz and 0.5° as at 25 Hz and 0.25°
+MAX_RAYS = 10_000
+MAX_STEP_RAD = math.radians(6.5)
+MAX_ANGLE_RAD = 2 * math.pi
 FACTORY: dict[str, tuple[Any, ...]] = {
     "LMPscancfg": (2500, 1, 2500, FIELD_START_1E4DEG, FIELD_STOP_1E4DEG),
     "LMPoutputRange": (1, 2500, FIELD_START_1E4DEG, FIELD_STOP_1E4DEG),
@@ -60,13 +63,30 @@ DONE = {"LMCstandby": 0, "mEEwriteall": 1, "LSPsetdatetime": 1}  # methods that 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """One turn's rays, in the scanner's frame (x ahead, counter-clockwise)."""
+    """One turn's rays, quantised, in the scanner's frame (x ahead, counter-clockwise)."""
 
     first_ray_ns: int
-    ranges_m: NDArray[np.floating[Any]]  # (N,)
+    distances: NDArray[np.uint16]  # (N,) mm, or a code
     angle_min_rad: float
     angle_increment_rad: float
-    intensities: NDArray[np.floating[Any]] | None  # (N,)
+    remission: NDArray[np.float64] | None  # (N,)
+
+
+def make_sweep(
+    ranges_m: ArrayLike,
+    first_ray_ns: int,
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    intensities: ArrayLike | None,
+) -> Sweep:
+    """A sweep of (N,) ranges and as many intensities, or none. Raises: ValueError, if no scanner can measure it."""
+    ranges = np.asarray(ranges_m, np.float64)
+    remission = None if intensities is None or np.size(intensities) == 0 else np.asarray(intensities, np.float64)
+    if ranges.ndim != 1 or ranges.size > MAX_RAYS or (remission is not None and remission.shape != ranges.shape):
+        raise ValueError("a sweep is one row of ranges, and as many intensities or none")
+    if not 0 < angle_increment_rad <= MAX_STEP_RAD or not abs(angle_min_rad) <= MAX_ANGLE_RAD:
+        raise ValueError(f"rays from {angle_min_rad} rad in steps of {angle_increment_rad} rad")
+    return Sweep(first_ray_ns, quantise_ranges(ranges), angle_min_rad, angle_increment_rad, remission)
 
 
 class EmulatedScanner:
@@ -182,7 +202,7 @@ class EmulatedScanner:
 
     def last_ray_ns(self, sweep: Sweep) -> int:
         step = round(math.degrees(sweep.angle_increment_rad) * 1e4)
-        return sweep.first_ray_ns + round(1000 * sweep_us(len(sweep.ranges_m), step, self.period_us()))
+        return sweep.first_ray_ns + round(1000 * sweep_us(len(sweep.distances), step, self.period_us()))
 
     def scan_data(self, sweep: Sweep, now_ns: int) -> ScanData:
         """The telegram of a sweep that is transmitted now; counts it."""
@@ -193,11 +213,11 @@ class EmulatedScanner:
         self._index_ns = index_ns
         self._telegram_counter = (self._telegram_counter + 1) % 65536
         self._scan_counter = (self._scan_counter + turns) % 65536
-        channels = [Channel("DIST1", 1.0, 0.0, start, step, quantise_ranges(sweep.ranges_m))]
+        channels = [Channel("DIST1", 1.0, 0.0, start, step, sweep.distances)]
         channels8: list[Channel] = []
         with_remission, in_16_bit = self._variables["LMDscandatacfg"][2:4]
-        if with_remission and sweep.intensities is not None:
-            remission = np.round(sweep.intensities)
+        if with_remission and sweep.remission is not None:
+            remission = np.round(np.nan_to_num(sweep.remission))
             if in_16_bit:
                 data16 = np.clip(remission, 0, 65535).astype(np.uint16)
                 channels.append(Channel("RSSI1", 1.0, 0.0, start, step, data16))

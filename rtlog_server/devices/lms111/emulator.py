@@ -11,7 +11,6 @@ no telegram.
 
 import heapq
 import itertools
-import math
 import queue
 import selectors
 import socket
@@ -21,11 +20,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Self
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from rtlog_server.devices.lms111.cola import ColaError, Dialect, Receiver
-from rtlog_server.devices.lms111.emulated_scanner import EmulatedScanner, Sweep
+from rtlog_server.devices.lms111.emulated_scanner import EmulatedScanner, Sweep, make_sweep
 from rtlog_server.devices.lms111.protocol import (
     CONDITION_FAILED,
     INVALID_DATA,
@@ -38,9 +36,6 @@ from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
 
 READY_AFTER_NS = 500_000  # from the last ray to the transmission
 SEND_S = 1.0
-MAX_RAYS = 10_000
-MAX_STEP_RAD = math.radians(6.5)
-MAX_ANGLE_RAD = 2 * math.pi
 RESET_ON_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: close() sends RST, as a device that lost its power does
 
 
@@ -127,13 +122,8 @@ class Lms111Emulator:
         Raises:
             ValueError: no scanner can measure such a sweep.
         """
-        ranges = np.asarray(ranges_m, np.float64)
-        remission = None if intensities is None or np.size(intensities) == 0 else np.asarray(intensities, np.float64)
-        if ranges.ndim != 1 or ranges.size > MAX_RAYS or (remission is not None and remission.shape != ranges.shape):
-            raise ValueError("a sweep is one row of ranges, and as many intensities or none")
-        if not 0 < angle_increment_rad <= MAX_STEP_RAD or abs(angle_min_rad) > MAX_ANGLE_RAD:
-            raise ValueError(f"rays from {angle_min_rad} rad in steps of {angle_increment_rad} rad")
-        self._post(self._measure, Sweep(first_ray_ns, ranges, angle_min_rad, angle_increment_rad, remission))
+        sweep = make_sweep(ranges_m, first_ray_ns, angle_min_rad, angle_increment_rad, intensities)
+        self._post(self._measure, sweep)
 
     def send_raw(self, data: bytes) -> None:
         """Put any bytes on the wire."""

@@ -143,6 +143,7 @@ class BinaryWriter:
 class AsciiWriter:
     def __init__(self, command: str) -> None:
         self._parts = [command.encode()]
+        self._hexadecimal = hexadecimal()  # here, so that no scan waits for the making of the table
 
     def put(self, layout: str, *values: float) -> None:
         for code, value in zip(layout, values, strict=True):
@@ -162,7 +163,7 @@ class AsciiWriter:
             self.characters(text)
 
     def array(self, values: Array) -> None:
-        self._parts += hexadecimal()[values].tolist()
+        self._parts += self._hexadecimal[values].tolist()
 
     def payload(self) -> bytes:
         return b" ".join(self._parts)
