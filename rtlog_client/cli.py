@@ -14,7 +14,9 @@ from tqdm import tqdm
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.profile import parse_profile, read_profile_text
+from rtlog_client.audit import audit
 from rtlog_client.live_line import LiveLine
+from rtlog_client.log_file import read_info
 from rtlog_client.record import record
 from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
 from rtlog_client.recover import recover
@@ -39,6 +41,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("recording", type=Path, metavar="FILE", help="NAME.mcap.part or NAME.mcap; it is only read")
     verb.add_argument("-o", "--output", type=Path, metavar="OUT.mcap", help="default: NAME.mcap, NAME.recovered.mcap")
     verb.add_argument("--json", action="store_true", help="what came back as JSON")
+
+    example = "rtlog-client audit recordings/20260304T071500Z_canmet_trailer.mcap"
+    verb = add_verb(verbs, "audit", _audit, "check a recording against the contract; status 1 if it breaks it", example)
+    verb.add_argument("recording", type=Path, metavar="RUN.mcap")
+    verb.add_argument("--json", action="store_true", help="all of it as JSON")
 
     example = "rtlog-client replay recordings/a.mcap --to devices --profile simulated"
     verb = add_verb(verbs, "replay", _replay, "play a recording to the device emulators or on zenoh", example)
@@ -109,6 +116,21 @@ def _recover(args: argparse.Namespace) -> None:
     else:
         lost = f"{recovery.damaged_chunks} damaged chunks and {recovery.orphans} messages without their topic left out"
         print(f"  {lost}, {recovery.skipped_bytes} bytes unreadable")
+
+
+def _audit(args: argparse.Namespace) -> int:
+    total = sum(read_info(args.recording).message_counts.values())
+    with tqdm(total=total, unit=" messages", delay=1.0, disable=None, leave=False) as bar:
+        result = audit(args.recording, lambda count: bar.update(count - bar.n))
+    if args.json:
+        print(json.dumps({**asdict(result), "path": str(result.path)}))
+        return 0 if result.ok else 1
+    print(f"{'topic':24}{'messages':>10}{'rate [Hz]':>11}{'longest gap [s]':>17}{'lost':>7}")
+    for row in result.topics:
+        print(f"{row.topic:24}{row.messages:10}{row.rate_hz:11.3f}{row.longest_gap_s:17.3f}{row.lost:7}")
+    for check in result.checks:
+        print(f"{'ok   ' if check.ok else 'WRONG'} {check.rule}{f': {check.detail}' if check.detail else ''}")
+    return 0 if result.ok else 1
 
 
 def _replay(args: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ all that was written so far safe against a power cut; `finish` writes the index 
 Times are nanoseconds UTC: log_time is the tick's, publish_time the header stamp's (see the contract of recordings).
 """
 
+import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from hw_profiles.errors import BadInputError
 from rtlog_server.messages import schema_text
 
 METADATA_NAME = "rtlog"
+LOSS_NAME = "rtlog.loss"  # topic: JSON {"received", "lost", "holes": [[first, last], …]}, sequence numbers
 PROFILE_NAME = "profile.toml"
 CHUNK_BYTES = 256 * 1024
 
@@ -45,6 +47,7 @@ class LogInfo:
     start_ns: int
     end_ns: int
     msgtypes: dict[str, str] = field(default_factory=dict)  # per topic
+    lost: dict[str, int] = field(default_factory=dict)  # per topic, as the recorder counted; empty if it did not
 
 
 class LogWriter:
@@ -194,6 +197,7 @@ def read_info(path: Path) -> LogInfo:
         start_ns=statistics.message_start_time,
         end_ns=statistics.message_end_time,
         msgtypes=msgtypes,
+        lost={topic: int(json.loads(text)["lost"]) for topic, text in records.get(LOSS_NAME, {}).items()},
     )
 
 

@@ -18,14 +18,13 @@ from typing import Any
 from uuid import UUID
 
 from rtlog_client.holes import SequenceHoles
-from rtlog_client.log_file import LogWriter
+from rtlog_client.log_file import LOSS_NAME, LogWriter
 from rtlog_server.attachment import Attachment
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import TAGS, TICK, Topic
 
 log = logging.getLogger(__name__)
 
-LOSS_NAME = "rtlog.loss"
 TICKS_REMEMBERED = 600
 EARLY_SAMPLES = 1000  # that may wait for the first Tick
 SHOWN_HOLES = 5

@@ -111,7 +111,7 @@ class BenchServer:
         self._session.close()
 
 
-def free_port() -> int:
+def find_free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -123,9 +123,20 @@ def start_server() -> Iterator[Callable[..., BenchServer]]:
     servers = []
 
     def start(port: int | None = None, vehicle: str = "bench") -> BenchServer:
-        servers.append(BenchServer(port or free_port(), vehicle))
+        servers.append(BenchServer(port or find_free_port(), vehicle))
         return servers[-1]
 
     yield start
     for server in servers:
         server.close()
+
+
+@pytest.fixture
+def bench() -> type[BenchServer]:
+    """What ticks hold, without a server: `bench.messages(k)`, `bench.tick_ns(k)`."""
+    return BenchServer
+
+
+@pytest.fixture
+def free_port() -> int:
+    return find_free_port()

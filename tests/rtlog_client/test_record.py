@@ -21,10 +21,10 @@ from rosbags.highlevel import AnyReader
 
 from hw_profiles.errors import BadInputError, RTLogError
 from rtlog_client.cli import main
-from rtlog_client.log_file import read_info, read_messages
+from rtlog_client.log_file import LOSS_NAME, read_info, read_messages
 from rtlog_client.record import record
 from rtlog_client.recorder import Progress, RecordConfig
-from rtlog_client.run_log import LOSS_NAME, RunSummary
+from rtlog_client.run_log import RunSummary
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import DIAGNOSTICS, JOINT_STATES, PRIMARY_SCAN, TAGS, TICK
 
