@@ -118,7 +118,7 @@ class AsciiReader:
 
 class BinaryWriter:
     def __init__(self, command: str) -> None:
-        self._parts = [command.encode() + b" "]
+        self._parts = [command.encode() + (b"" if command == "sFA" else b" ")]
 
     def put(self, layout: str, *values: float) -> None:
         self._parts.append(struct.pack(f">{layout}", *values))
