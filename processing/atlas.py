@@ -46,7 +46,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def write_atlas(path: Path, atlas: Atlas) -> None:
-    """Write the folder beside its place, and move it there when it is whole. Raises: BadInputError: it exists already."""
+    """Write the folder beside its place, and move it there once it is whole. Raises: BadInputError: it exists."""
     refuse_existing(path)
     part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:

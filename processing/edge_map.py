@@ -115,6 +115,7 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
     everything = np.arange(len(poses))
     known: set[tuple[int, int]] = set()
     solution = solve(poses, links)
+    loops = links[np.empty(0, np.int64)]
     for _ in range(MAX_ROUNDS):
         pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
@@ -125,7 +126,7 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
         if len(kept ^ known) <= 0.02 * len(kept):
             break
         known = kept
-    believed = (links + loops)[np.flatnonzero(solution.weights >= DOUBTED)]
+    believed = (links + loops)[np.flatnonzero(np.asarray(solution.weights) >= DOUBTED)]
     solution = solve(poses, believed)
     return PieceMap(solution.poses, firsts, believed, solution)
 
@@ -133,7 +134,7 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
 def _solve_present(poses: Array, links: Links, present: NDArray[np.bool_]) -> Array:
     """Solve for the key frames that are there already; the others wait."""
     numbers = np.cumsum(present) - 1
-    inside = present[links.ends].all(axis=1)
+    inside = np.flatnonzero(np.all(present[links.ends], axis=1))
     part = links[inside]
     part = Links(numbers[part.ends], part.motions, part.informations, part.robust)
     solved = poses.copy()

@@ -56,7 +56,7 @@ def solve_frames(
     poses = first_guess.copy()
     free = np.flatnonzero(np.repeat(~fixed, 3))
     cost, damping = _cost(poses, pieces, links), 0.0
-    for _ in range(max_iterations):
+    for _ in range(max_iterations if len(free) else 0):
         jacobian, error = _linearise(poses, pieces, links)
         jacobian = jacobian[:, free]
         normal = (jacobian.T @ jacobian).tocsc()
