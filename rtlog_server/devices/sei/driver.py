@@ -4,7 +4,7 @@ In: the bus and its encoders from the profile. Out: an `EncoderReading` a tick.
 
     start        asked, one after the other      done   tick
       |--- left ---|--- right ---|                 |      |
-           ^            ^                          |<3 ms>|
+           ^            ^                          |<4 ms>|
         latched      latched       measured_ns is their mean
 
 When a position was latched: an encoder answers at once with its latest look at the disc, and it looks each 4 ms; so on
@@ -23,7 +23,7 @@ from rtlog_server.devices.encoders import EncoderReading, TurnCounter, position_
 from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.port import SeiPort
 
-MARGIN_NS = 3_000_000  # from the last reply to the tick
+MARGIN_NS = 4_000_000  # from the last reply to the tick
 TURNAROUND_NS = 500_000  # first guess of what a reply takes beyond the wire
 SMOOTHING = 8  # rounds over which the length of a round is averaged
 SILENT_ROUNDS = 5  # without any answer, then the port is opened anew
