@@ -122,6 +122,8 @@ class Recorder:
                 (self._present.add if there else self._present.discard)(boot_id)
                 if was_there and not self._present:
                     log.warning("the server is gone; waiting for it")
+                elif self._present and not was_there and self._run is not None:
+                    log.info("the server is back")
 
     def _take_sample(self, item: Arrived) -> None:
         topic = BY_NAME.get(item.topic)

@@ -1,7 +1,9 @@
 """A server that a test has in its hand: it speaks the contract on zenoh, tick by tick, and loses what it is told to."""
 
+import contextlib
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from uuid import UUID, uuid4
@@ -111,6 +113,51 @@ class BenchServer:
         self._session.close()
 
 
+class Link:
+    """A cable between two ports of this machine, which can be cut and mended."""
+
+    def __init__(self, to_port: int) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._to = ("127.0.0.1", to_port)
+        self._ends: list[socket.socket] = []
+        self._is_cut = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        self._is_cut = True
+        for end in self._ends:
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def mend(self) -> None:
+        self._is_cut = False
+
+    def close(self) -> None:
+        self.cut()
+        self._listener.shutdown(socket.SHUT_RDWR)  # wakes accept()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                if self._is_cut:
+                    near.close()
+                    continue
+                far = socket.create_connection(self._to)
+                self._ends += [near, far]
+                for source, sink in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                sink.sendall(data)
+            sink.shutdown(socket.SHUT_RDWR)
+        source.close()
+
+
 def find_free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -129,6 +176,20 @@ def start_server() -> Iterator[Callable[..., BenchServer]]:
     yield start
     for server in servers:
         server.close()
+
+
+@pytest.fixture
+def open_link() -> Iterator[Callable[[BenchServer], Link]]:
+    """open_link(server): a cable to it."""
+    links = []
+
+    def open_to(server: BenchServer) -> Link:
+        links.append(Link(int(server.endpoint.rsplit(":", 1)[1])))
+        return links[-1]
+
+    yield open_to
+    for link in links:
+        link.close()
 
 
 @pytest.fixture

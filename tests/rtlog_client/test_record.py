@@ -168,6 +168,31 @@ def test_losses_are_counted_exactly(
     assert times[50] == server.tick_ns(50)
 
 
+def test_a_link_that_breaks_leaves_a_counted_hole(
+    start_server: StartServer, start_recording: StartRecording, open_link: Any
+) -> None:
+    server = start_server()
+    link = open_link(server)
+    recording = start_recording(link.endpoint, name="run")
+    server.wait_for_subscriber()
+    for k in range(10):
+        server.tick(k)
+    recording.wait(lambda progress: progress.ticks == 10)
+    link.cut()
+    recording.wait(lambda progress: not progress.there)
+    for k in range(10, 25):
+        server.tick(k)  # nobody hears it
+    link.mend()
+    server.wait_for_subscriber()
+    for k in range(25, 30):
+        server.tick(k)
+    server.heartbeat()
+    recording.wait(lambda progress: progress.there and progress.ticks == 15 and progress.lost == 62)
+    [summary] = recording.stop()
+    assert summary.path.name == "run.mcap"
+    assert summary.lost == {**dict.fromkeys(EVERY_TICK, 15), DIAGNOSTICS.name: 2}
+
+
 def test_another_run_of_the_server_is_another_file(
     start_server: StartServer, start_recording: StartRecording, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
