@@ -31,8 +31,10 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STRETCH_M = 15.0
+SEARCHES = 8  # of a stretch that is astray
 MAX_ROUNDS = 5
-MAX_DRIFT_M, MAX_DRIFT_RAD = 4.0, 0.6  # beyond, a search finds more wrong places than right ones
+MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
+WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
 DOUBTED = 0.1  # a strong link of less weight is dropped, and may be found again from better poses
 
 
@@ -44,6 +46,7 @@ class Path:
     keyframes: Ints  # (K,) their numbers in the run
     scans: list[Scan]
     chain: Links  # K - 1 weak links, between (0, 1), (1, 2) …
+    wheels: Links  # K - 1, odometry alone
     start: Array  # (3,) first guess of the first pose in the frame of the piece
 
 
@@ -65,42 +68,49 @@ class Drift:
     variance_m2: float = 0.0  # of the links' own position
     variance_rad2: float = 0.0
     sway_m: float = 0.0  # what the heading's error makes of the way: it adds up as metres, not as variances
+    way_m: float = 0.0
 
     def after(self, chain: Links) -> "Drift":
         covariances = np.linalg.inv(chain.informations)
         turn = self.variance_rad2 + np.cumsum(covariances[:, 2, 2])
         steps = np.hypot(*chain.motions[:, :2].T)
         moved = covariances[:, 0, 0].sum() + covariances[:, 1, 1].sum()
-        return Drift(self.variance_m2 + float(moved), float(turn[-1]), self.sway_m + float(steps @ np.sqrt(turn)))
+        return Drift(
+            self.variance_m2 + float(moved),
+            float(turn[-1]),
+            self.sway_m + float(steps @ np.sqrt(turn)),
+            self.way_m + float(steps.sum()),
+        )
 
     @property
     def radius_m(self) -> float:
-        return min(3 * float(np.hypot(self.variance_m2**0.5, self.sway_m)), MAX_DRIFT_M)
+        return min(3 * float(np.hypot(self.variance_m2**0.5, self.sway_m)) + 0.02 * self.way_m, MAX_DRIFT_M)
 
     @property
     def radius_rad(self) -> float:
-        return min(3 * self.variance_rad2**0.5, MAX_DRIFT_RAD)
+        return min(3 * self.variance_rad2**0.5 + 0.003 * self.way_m, MAX_DRIFT_RAD)
 
 
 def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
     """Find strong links and solve until they settle. The first pose of the first path stays where it starts."""
     frames, chain, firsts = _join(paths, mount, match)
     poses = np.concatenate([accumulate(path.start, path.chain.motions) for path in paths])
-    links = chain + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
+    links = chain + _wheels(paths, firsts) + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
     loops = links[np.zeros(0, np.int64)]
     count = len(poses)
     present = np.zeros(count, bool)
     for path in range(len(paths)):
         drift = Drift()
-        for stretch in _stretches(frames, np.arange(firsts[path], firsts[path + 1])):
+        for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
             if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
                 poses[stretch] = accumulate(poses[stretch[0] - 1], onward.motions)[1:]
                 drift = drift.after(onward)
             pairs = loop_pairs(frames, poses, stretch, np.flatnonzero(present), LOOP_RADIUS_M + drift.radius_m)
-            found = match_pairs(frames, poses, pairs, LOOP_INLIERS)
-            if len(found) < 0.3 * len(pairs) and drift.radius_m > 0.5:
-                found = match_pairs(frames, poses, pairs[::2], SEARCH_INLIERS, drift.radius_m, drift.radius_rad)
+            astray = drift.radius_m > 1.0 or drift.radius_rad > 0.2
+            found = match_pairs(frames, poses, pairs, SEARCH_INLIERS if astray else LOOP_INLIERS)
+            if astray and len(found) < 0.3 * len(pairs):
+                found = match_pairs(frames, poses, pairs[:: max(1, len(pairs) // SEARCHES)], SEARCH_INLIERS, drift.radius_m, drift.radius_rad)
             present[stretch] = True
             if len(found) or stretch[0] == firsts[path]:
                 loops = loops + found
@@ -158,6 +168,16 @@ def _join(paths: list[Path], mount: Array, match: Matcher) -> tuple[KeyFrames, L
     return frames, chain, firsts
 
 
-def _stretches(frames: KeyFrames, members: Ints) -> list[Ints]:
+def _stretches(frames: KeyFrames, chain: Links, members: Ints) -> list[Ints]:
+    """Cut a drive every STRETCH_M, and wherever its chain is so weak that what follows may lie elsewhere."""
     bins = (frames.travelled[members] // STRETCH_M).astype(int)
-    return np.split(members, np.flatnonzero(np.diff(bins)) + 1)
+    covariances = np.linalg.inv(chain.informations[np.isin(chain.ends[:, 1], members[1:])])
+    weak = (covariances[:, 0, 0] + covariances[:, 1, 1] > WEAK_M**2) | (covariances[:, 2, 2] > WEAK_RAD**2)
+    return np.split(members, np.flatnonzero((np.diff(bins) != 0) | weak) + 1)
+
+
+def _wheels(paths: list[Path], firsts: Ints) -> Links:
+    links = paths[0].wheels
+    for path, first in zip(paths[1:], firsts[1:], strict=False):
+        links = links + path.wheels.shifted(int(first))
+    return links

@@ -44,7 +44,8 @@ class OpenLoop:
     points: NDArray[np.float32]  # (n, B, 2) m, scanner frame, the motion during the sweep removed; NaN without a return
     keyframes: Ints  # (K,) scan indices, the first is 0
     scans: list[Scan]  # K
-    links: Links  # K - 1, between key frames in a row: the chain
+    links: Links  # K - 1, between key frames in a row, fused: the chain
+    wheels: Links  # K - 1, the same by odometry alone, with ample doubt: what is left where a match was wrong
     reference: Ints  # (n,) which key frame a scan was matched to
     offsets: Array  # (n, 3) pose of a scan in the frame of that key frame
     matched: NDArray[np.bool_]  # (n,) False: odometry alone
@@ -118,6 +119,8 @@ class _Chain:
         self.scans: list[Scan] = []
         self.motions: list[Array] = []
         self.covariances: list[Array] = []
+        self.odometry_motions: list[Array] = []
+        self.odometry_covariances: list[Array] = []
         self.reference, self.offsets = np.zeros(count, np.int64), np.zeros((count, 3))
         self.matched = np.zeros(count, bool)
         self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))  # fused, since the key frame
@@ -128,6 +131,8 @@ class _Chain:
         if self.keyframes:
             self.motions.append(self.offset)
             self.covariances.append(self.covariance)
+            self.odometry_motions.append(self.driven)
+            self.odometry_covariances.append(GATE * self.driven_covariance)
         self.keyframes.append(k)
         self.scans.append(scan)
         self.reference[k], self.offsets[k] = len(self.keyframes) - 1, 0.0
@@ -158,7 +163,9 @@ class _Chain:
         """Take odometry's word for scan `k`."""
         j_before, j_step = compose_jacobians(self.offset, step)
         covariance = j_before @ self.covariance @ j_before.T + j_step @ (GATE * noise) @ j_step.T
-        self._arrive(k, compose(self.offset, step), covariance, compose(self.driven, step), covariance, 0.0)
+        j_before, j_step = compose_jacobians(self.driven, step)
+        driven_covariance = j_before @ self.driven_covariance @ j_before.T + j_step @ noise @ j_step.T
+        self._arrive(k, compose(self.offset, step), covariance, compose(self.driven, step), driven_covariance, 0.0)
 
     def _arrive(
         self, k: int, offset: Array, covariance: Array, driven: Array, driven_cov: Array, inliers: float
@@ -196,19 +203,21 @@ def estimate_open_loop(run: Run, forced: Ints, match: Matcher = match_scans) -> 
         if chain.wants_keyframe or k in cuts:
             chain.add_keyframe(k, current)
         before = current
-    links = len(chain.motions)
     return OpenLoop(
         odometry,
         points,
         np.array(chain.keyframes, np.int64),
         chain.scans,
-        Links.of(
-            np.column_stack([np.arange(links), np.arange(1, links + 1)]),
-            np.array(chain.motions).reshape(links, 3),
-            np.asarray(np.linalg.inv(np.array(chain.covariances).reshape(links, 3, 3)), np.float64),
-            robust=False,
-        ),
+        _in_a_row(chain.motions, chain.covariances, robust=True),
+        _in_a_row(chain.odometry_motions, chain.odometry_covariances, robust=False),
         chain.reference,
         chain.offsets,
         chain.matched,
     )
+
+
+def _in_a_row(motions: list[Array], covariances: list[Array], robust: bool) -> Links:
+    count = len(motions)
+    ends = np.column_stack([np.arange(count), np.arange(1, count + 1)])
+    informations = np.asarray(np.linalg.inv(np.array(covariances).reshape(count, 3, 3)), np.float64)
+    return Links.of(ends, np.array(motions).reshape(count, 3), informations, robust)

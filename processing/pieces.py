@@ -62,7 +62,8 @@ def cut_span(run_id: str, loop: OpenLoop, ranges: NDArray[np.float32], angles: A
     """What one span gives to its piece; the passes at its ends are key frames."""
     a, b = (int(np.searchsorted(loop.keyframes, scan)) for scan in (span.first, span.last))
     chain = loop.links[np.arange(a, b)].shifted(-a)
-    path = Path(run_id, np.arange(a, b + 1), loop.scans[a : b + 1], chain, np.zeros(3))
+    wheels = loop.wheels[np.arange(a, b)].shifted(-a)
+    path = Path(run_id, np.arange(a, b + 1), loop.scans[a : b + 1], chain, wheels, np.zeros(3))
     scans = np.arange(span.first, span.last + 1)
     travelled = np.append(0.0, np.cumsum(np.hypot(*loop.odometry.deltas[span.first : span.last, :2].T)))
     shown = scans[np.unique(np.floor(travelled / GRID_SPACING_M), return_index=True)[1]]

@@ -1,0 +1,247 @@
+"""Edge assembly: where the beacons lie, from the lengths of the drifts and the turns between them (paper, section 2.4).
+
+In: a graph of nodes and edges, the length of each edge, measured turns from one edge to another. Out: positions of the
+nodes. Its law: each edge has one orientation Θ, that of X_j - X_i for its own order (i, j), whichever way it was driven.
+
+    minimise  Σ weight · wrap(Θ_b - Θ_a - turn)²      eq. (6), Θ_e = atan2(X_j - X_i)     eq. (8)
+    subject to  ‖X_j - X_i‖ = L_ij for every edge     eq. (7)
+
+Solved by Lagrange-Newton steps on sparse matrices (Gauss-Newton in the turns). A length is held by a spring that is
+stiffened stage by stage, until it is as good as rigid: far from the solution the soft ones let the layout unfold, and
+lengths that contradict each other show themselves, for they stay apart however stiff their springs. Then the compromise
+by the lengths' variances is the answer, and the contradiction is named.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.linalg import SuperLU, splu
+
+from processing.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+TURN_STD_RAD = np.radians(1.0)  # of turns and lengths that come without a weight
+LENGTH_STD_M = 0.1
+STAGES = (1e-2, 1e-4, 1e-6, 1e-8)  # of the mean length: by how much a spring gives way
+MAX_STEPS = 30  # of Newton, a stage
+HELD_M = 1e-3  # lengths that hold to this hold
+
+
+@dataclass(frozen=True, slots=True)
+class Assembly:
+    """Where the nodes lie. Each connected part has its own frame: its first node at the origin, its first edge along x."""
+
+    positions: Array  # (n, 2) m
+    parts: Ints  # (n,) number of the connected part of each node
+    violated: list[
+        int
+    ]  # edges whose lengths contradict each other; then the lengths hold only as their variances allow
+    iterations: int
+    converged: bool
+
+
+def turn_from_headings(alpha: Array | float, delta: Array | float, beta: Array | float) -> Array:
+    """Θ_b - Θ_a (eq. 5, its signs by geometry) where a drive goes from edge a to edge b.
+
+    The last pose on a has heading Θ_a + α in the world, the first on b has Θ_b + β, and is turned against it by δ:
+    Θ_b + β = Θ_a + α + δ. Each heading is in the frame of its edge, whichever way the edge is driven.
+    """
+    return wrap_angle(np.asarray(alpha) + delta - beta)
+
+
+def assemble_paper(
+    n_nodes: int,
+    edges: Ints,  # (m, 2) nodes i, j of each, i != j
+    lengths: Array,  # (m,) m, above 0
+    turn_edges: Ints,  # (t, 2) edges a, b
+    turn_angles: Array,  # (t,) rad, Θ_b - Θ_a
+    turn_weights: Array | None = None,  # (t,) 1/rad²; None: all alike, as in the paper
+    length_variances: Array | None = None,  # (m,) m²: who gives way where lengths contradict each other
+) -> Assembly:
+    """Lay out every connected part of the graph by itself."""
+    weights = np.full(len(turn_angles), TURN_STD_RAD**-2) if turn_weights is None else turn_weights
+    variances = np.full(len(lengths), LENGTH_STD_M**2) if length_variances is None else length_variances
+    _, labels = connected_components(_adjacency(n_nodes, edges), directed=False)
+    positions, violated, iterations, converged = np.zeros((n_nodes, 2)), [], 0, True
+    for part in np.unique(labels[edges[:, 0]]):
+        nodes = np.flatnonzero(labels == part)
+        mine = np.flatnonzero(labels[edges[:, 0]] == part)
+        turns = np.flatnonzero(labels[edges[turn_edges[:, 0], 0]] == part)
+        graph = _Part(
+            np.searchsorted(nodes, edges[mine]),
+            lengths[mine],
+            np.searchsorted(mine, turn_edges[turns]),
+            turn_angles[turns],
+            weights[turns],
+        )
+        solution = _solve(graph, variances[mine])
+        positions[nodes] = _in_own_frame(solution.positions, graph.edges[0])
+        violated += mine[solution.violated].tolist()
+        iterations, converged = iterations + solution.iterations, converged and solution.converged
+    return Assembly(positions, labels.astype(np.int64), violated, iterations, converged)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One connected part, nodes and edges counted from 0."""
+
+    edges: Ints  # (m, 2)
+    lengths: Array  # (m,)
+    turn_edges: Ints  # (t, 2)
+    turn_angles: Array  # (t,)
+    weights: Array  # (t,)
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    positions: Array
+    violated: Ints
+    iterations: int
+    converged: bool
+
+
+def _adjacency(n: int, pairs: Ints) -> sparse.csr_array:
+    return sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+
+
+def _in_own_frame(positions: Array, first_edge: Ints) -> Array:
+    along = positions[first_edge[1]] - positions[first_edge[0]]
+    c, s = along / np.hypot(*along)
+    return np.asarray((positions - positions[0]) @ np.array([[c, -s], [s, c]]))
+
+
+def _solve(part: _Part, variances: Array) -> _Solution:
+    positions, iterations, unit = _first_guess(part), 0, part.lengths.mean()
+    last_gap = np.inf
+    for stage in STAGES:
+        rigid = np.full(len(part.lengths), (stage * unit) ** 2)
+        positions, steps, converged = _minimise(part, positions, rigid, 1e-12 if stage == STAGES[-1] else 1e-2)
+        iterations += steps
+        gaps = np.abs(_residuals(part, positions)[1])
+        if gaps.max() > max(last_gap / 2, HELD_M):  # stiffer springs do not close them: there is no such layout
+            positions, steps, converged = _minimise(part, positions, variances, 1e-12)
+            return _Solution(positions, np.flatnonzero(gaps > HELD_M), iterations + steps, converged)
+        last_gap = gaps.max()
+    return _Solution(positions, np.flatnonzero(gaps > HELD_M), iterations, converged)
+
+
+def _first_guess(part: _Part) -> Array:
+    """Orientations along a spanning tree of the turns, then least squares on turns and on edges as vectors.
+
+    Edges that no chain of turns joins form groups; the groups turn against each other so that the edges close best: with
+    nodes and turns r of the groups as complex numbers, z_j - z_i = L exp(iΘ) r is linear.
+    """
+    m, n = len(part.lengths), int(part.edges.max()) + 1
+    angles, groups = _spread_turns(part)
+    vectors = part.lengths * np.exp(1j * angles)
+    rows, unit = np.arange(m), part.lengths.mean()
+    incidence = sparse.csc_array(
+        (np.r_[np.ones(m), -np.ones(m)], (np.r_[rows, rows], np.r_[part.edges[:, 1], part.edges[:, 0]])), shape=(m, n)
+    )
+    turned = sparse.csc_array((-vectors, (rows, groups)), shape=(m, groups.max() + 1))
+    keep = np.delete(np.arange(n), 0)
+    design = sparse.hstack([incidence[:, keep], turned[:, 1:]]).tocsc()
+    wanted = np.where(groups == 0, vectors, 0)
+    # a group that hangs on one node may turn freely: it stays as it is
+    prior = np.r_[np.zeros(n - 1), np.full(groups.max(), 1e-6 * unit**2)]
+    normal = (design.conj().T @ design + sparse.diags_array(prior)).tocsc()
+    solved = _factorise(normal.astype(complex)).solve(design.conj().T @ wanted + prior)
+    z = np.r_[0, solved[: n - 1]]
+    return np.column_stack([z.real, z.imag])
+
+
+def _spread_turns(part: _Part) -> tuple[Array, Ints]:
+    """Orientations (m,) of the edges that fit the turns best, and the group (m,) of edges that turns join."""
+    m = len(part.lengths)
+    n_groups, groups = connected_components(_adjacency(m, part.turn_edges), directed=False)
+    first = np.full(n_groups, -1)
+    first[groups[::-1]] = np.arange(m)[::-1]
+    if not len(part.turn_angles):
+        return np.zeros(m), groups.astype(np.int64)
+    a, b = part.turn_edges[:, 0], part.turn_edges[:, 1]
+    angles, turns = np.zeros(m), {}
+    for i, j, turn in zip(a.tolist(), b.tolist(), part.turn_angles.tolist(), strict=True):
+        turns[i, j], turns[j, i] = turn, -turn
+    both_ways = _adjacency(m, np.vstack([part.turn_edges, part.turn_edges[:, ::-1]]))
+    for start in first:
+        order, before = breadth_first_order(both_ways, start, directed=False)
+        for edge in order[1:].tolist():
+            angles[edge] = angles[before[edge]] + turns[int(before[edge]), edge]
+    rows = np.arange(len(a))
+    design = sparse.csc_array((np.r_[np.ones(len(a)), -np.ones(len(a))], (np.r_[rows, rows], np.r_[b, a])), (len(a), m))
+    left = wrap_angle(part.turn_angles - (angles[b] - angles[a]))
+    free = np.setdiff1d(np.arange(m), first)
+    weighted = sparse.diags_array(part.weights) @ design[:, free]
+    angles[free] += _factorise((design[:, free].T @ weighted).tocsc()).solve(weighted.T @ left)
+    return angles, groups.astype(np.int64)
+
+
+def _residuals(part: _Part, positions: Array) -> tuple[Array, Array]:
+    """Turns (t,) [rad] and lengths (m,) [m] as laid out, less as measured."""
+    d = positions[part.edges[:, 1]] - positions[part.edges[:, 0]]
+    angles = np.arctan2(d[:, 1], d[:, 0])
+    turned = angles[part.turn_edges[:, 1]] - angles[part.turn_edges[:, 0]]
+    return wrap_angle(turned - part.turn_angles), np.hypot(d[:, 0], d[:, 1]) - part.lengths
+
+
+def _jacobians(part: _Part, positions: Array) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Of the turns (t, 2n) and the lengths (m, 2n); columns x0, y0, x1, y1 …"""
+    m, n = len(part.lengths), len(positions)
+    i, j = part.edges[:, 0], part.edges[:, 1]
+    d = positions[j] - positions[i]
+    length = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-3 * part.lengths)  # two nodes that fell together: some direction
+    ux, uy = d[:, 0] / length, d[:, 1] / length
+    rows = np.tile(np.arange(m), 4)
+    columns = np.concatenate([2 * i, 2 * i + 1, 2 * j, 2 * j + 1])
+    of_lengths = sparse.csr_array((np.concatenate([-ux, -uy, ux, uy]), (rows, columns)), shape=(m, 2 * n))
+    swing = np.concatenate([uy / length, -ux / length, -uy / length, ux / length])  # of atan2
+    of_angles = sparse.csr_array((swing, (rows, columns)), shape=(m, 2 * n))
+    return of_angles[part.turn_edges[:, 1]] - of_angles[part.turn_edges[:, 0]], of_lengths
+
+
+def _minimise(part: _Part, positions: Array, variances: Array, tolerance: float) -> tuple[Array, int, bool]:
+    """½ Σ weight · turn² + ½ Σ (length gap)² / variance: the layout, the steps taken, whether it settled.
+
+    Each step solves [H Aᵀ; A -D] [dx; λ] = [-g; -gaps] with D the variances: λ is the force in each edge, and D may go to
+    zero, which is the Lagrange-Newton step of the rigid problem.
+    """
+
+    def cost(at: Array) -> float:
+        turns, gaps = _residuals(part, at)
+        return float(part.weights @ turns**2 + np.sum(gaps**2 / variances)) / 2
+
+    unit, damping, now = float(part.lengths.mean()), 1e-6, cost(positions)
+    for step in range(1, MAX_STEPS + 1):
+        turns, gaps = _residuals(part, positions)
+        of_turns, of_lengths = _jacobians(part, positions)
+        weighted = sparse.diags_array(part.weights) @ of_turns
+        hessian = of_turns.T @ weighted
+        scale = max(hessian.diagonal().mean(), unit**-2)
+        hessian = hessian + sparse.diags_array(np.full(positions.size, damping * scale))  # nor drift, nor free hinges
+        system = sparse.block_array([[hessian, of_lengths.T], [of_lengths, sparse.diags_array(-variances)]]).tocsc()
+        solved = _factorise(system).solve(np.concatenate([-(weighted.T @ turns), -gaps]))
+        move, part_of_it = solved[: positions.size].reshape(-1, 2), 1.0
+        if np.abs(move).max() < 1e-9 * unit:
+            return positions, step, True
+        while (after := cost(positions + part_of_it * move)) > now and part_of_it > 1e-3:
+            part_of_it /= 2
+        if after > now:
+            if damping > 1e3:
+                return positions, step, np.abs(move).max() < 1e-6 * unit
+            damping *= 100
+            continue
+        settled = now - after <= tolerance * (now + tolerance) and part_of_it == 1
+        positions, now, damping = positions + part_of_it * move, after, max(damping / 100, 1e-9)
+        if settled:
+            return positions, step, True
+    return positions, MAX_STEPS, False
+
+
+def _factorise(matrix: sparse.csc_array) -> SuperLU:
+    """LU of a symmetric matrix, the order of elimination by its pattern: a tenth of the fill of the default's."""
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1, options={"SymmetricMode": True})
