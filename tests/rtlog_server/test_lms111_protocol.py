@@ -198,6 +198,7 @@ def test_scans_come_back_as_they_went(scan: ScanData, dialect: Dialect, tail: by
 
 
 @given(scan=scan_data, dialect=st.sampled_from(DIALECTS), data=st.data())
+@settings(max_examples=60)
 def test_a_short_scan_is_refused(scan: ScanData, dialect: Dialect, data: st.DataObject) -> None:
     (payload,) = Receiver(dialect).feed(encode_scan_data(dialect, scan))
     cut = data.draw(st.integers(0, len(payload) - 1))
@@ -215,7 +216,7 @@ def test_arbitrary_bytes_raise_nothing_else(head: bytes, tail: bytes) -> None:
 
 
 @given(scan=scan_data, dialect=st.sampled_from(DIALECTS), data=st.data())
-@settings(max_examples=200)
+@settings(max_examples=60)
 def test_a_flipped_byte_raises_nothing_else(scan: ScanData, dialect: Dialect, data: st.DataObject) -> None:
     (payload,) = Receiver(dialect).feed(encode_scan_data(dialect, scan))
     broken = bytearray(payload)

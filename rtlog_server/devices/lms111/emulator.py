@@ -199,7 +199,7 @@ class Lms111Emulator:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_ON_CLOSE)
             connection.close()
             return
-        connection.settimeout(SEND_S)
+        connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._client = connection
         self._dialect = Dialect.B if self._scanner.speaks_cola_b else Dialect.A
@@ -210,7 +210,7 @@ class Lms111Emulator:
         if self._client is None:
             return  # it went while an earlier event was handled
         try:
-            data = self._client.recv(65536, socket.MSG_DONTWAIT)
+            data = self._client.recv(65536)
         except BlockingIOError:
             return
         except OSError:
@@ -240,7 +240,9 @@ class Lms111Emulator:
     def _send(self, data: bytes) -> None:
         if self._client is not None:
             try:
+                self._client.settimeout(SEND_S)
                 self._client.sendall(data)
+                self._client.setblocking(False)
             except OSError:
                 self._hang_up(False)
 
