@@ -53,9 +53,3 @@ class LiveLine:
         else:
             self._stream.write(line + "\n")
         self._stream.flush()
-
-    def end(self) -> None:
-        """Leave the last line standing."""
-        if self._terminal:
-            self._stream.write("\n")
-            self._stream.flush()

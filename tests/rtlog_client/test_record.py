@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -266,20 +267,34 @@ def test_several_vehicles_are_named(start_server: StartServer, tmp_path: Path) -
         record(RecordConfig(tmp_path, server.endpoint), threading.Event())
 
 
+@contextmanager
+def record_command(server: Any, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "rtlog_client.cli", "record", "-o", str(folder), "--connect", server.endpoint]
+    pipe = subprocess.PIPE
+    with subprocess.Popen([*command, *options], stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def record_30_ticks(server: Any, process: subprocess.Popen[str]) -> None:
+    """Returns when the process has told that it has synced them."""
+    assert process.stderr is not None
+    server.wait_for_subscriber()
+    for k in range(30):
+        server.tick(k)
+    assert any(line.startswith("30 ticks  0 lost") for line in process.stderr)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_leaves_a_finished_file(start_server: StartServer, tmp_path: Path, number: signal.Signals) -> None:
     server = start_server()
-    command = [sys.executable, "-m", "rtlog_client.cli", "record", "-o", str(tmp_path), "--connect", server.endpoint]
-    with subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as client:
-        assert client.stderr is not None
-        server.wait_for_subscriber()
-        for k in range(30):
-            server.tick(k)
-        lines = iter(client.stderr.readline, "")
-        assert next(line for line in lines if line.startswith("30 ticks  0 lost"))
-        client.send_signal(number)
-        output, _ = client.communicate(timeout=10)
-    assert client.returncode == 0
+    with record_command(server, tmp_path, "--json") as process:
+        record_30_ticks(server, process)
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=10)
+    assert process.returncode == 0
     [summary] = json.loads(output)
     assert summary["ticks"] == 30
     assert summary["lost"] == {}
@@ -290,14 +305,8 @@ def test_a_signal_leaves_a_finished_file(start_server: StartServer, tmp_path: Pa
 
 def test_a_killed_recording_gives_back_what_was_synced(start_server: StartServer, tmp_path: Path) -> None:
     server = start_server()
-    command = [sys.executable, "-m", "rtlog_client.cli", "record", "-o", str(tmp_path), "--connect", server.endpoint]
-    with subprocess.Popen([*command, "--name", "run"], stderr=subprocess.PIPE, text=True) as client:
-        assert client.stderr is not None
-        server.wait_for_subscriber()
-        for k in range(30):
-            server.tick(k)
-        lines = iter(client.stderr.readline, "")
-        assert next(line for line in lines if line.startswith("30 ticks"))  # told after the sync
-        client.kill()
+    with record_command(server, tmp_path, "--name", "run") as process:
+        record_30_ticks(server, process)
+        process.kill()
     assert main(["recover", str(tmp_path / "run.mcap.part")]) == 0
     assert read_info(tmp_path / "run.mcap").message_counts[TICK.name] == 30
