@@ -64,7 +64,7 @@ def test_samples_of_a_tick_come_in_order_with_their_attachment(info: ServerInfo,
             pair = [Sample(TICK, k, b"tick %d" % k), Sample(SCAN, 2 * k, b"scan %d" % k)]
             publisher.publish(Bundle(7 + k, pair, REPORT if k % 10 == 0 else None))
         publisher.heartbeat()
-        wait_until(lambda: samples[-1].payload.to_bytes().startswith(b"{") and len(samples) >= 43)
+        wait_until(lambda: any(b'"last_tick": 26' in sample.payload.to_bytes() for sample in list(samples)))
     expected = []
     for k in range(20):
         expected += [(f"rtlog/trailer{TICK}", k, 7 + k), (f"rtlog/trailer{SCAN}", 2 * k, 7 + k)]
@@ -94,14 +94,14 @@ def test_the_end_of_the_pipe_publishes_all_and_a_last_heartbeat(info: ServerInfo
         wait_until(lambda: bool(samples))  # the heartbeat of a server that has not ticked yet
         assert json.loads(samples[0].payload.to_bytes())["last_tick"] is None
         samples.clear()
-        for k in range(1000):
+        for k in range(100):
             ours.send(Bundle(k, [Sample(TICK, k, bytes(4000))], None))
         ours.close()
         thread.join(timeout=20)
         assert not thread.is_alive()
-        wait_until(lambda: "@" in str(samples[-1].key_expr) and b"999" in samples[-1].payload.to_bytes())
+        wait_until(lambda: any(b'"last_tick": 99' in sample.payload.to_bytes() for sample in list(samples)))
     ticks = [unpack_attachment(s.attachment.to_bytes()).tick for s in samples if "@" not in str(s.key_expr)]
-    assert ticks == list(range(1000))
+    assert ticks == list(range(100))
 
 
 def test_a_taken_endpoint_is_told_in_one_line(info: ServerInfo) -> None:
