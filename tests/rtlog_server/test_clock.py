@@ -74,6 +74,18 @@ def test_a_restarted_device_starts_anew() -> None:
     assert np.percentile(error_ns, 99) < 1 * MS
 
 
+def test_a_restart_that_looks_like_a_step_ahead() -> None:
+    # The count stood 22 s before its wrap and falls to 8 s, as it would have done in 30 s; the device was away for 60 s.
+    device_us, receive_ns, true_ns = deliveries(
+        np.random.default_rng(4), 4000, first_us=WRAP_US - 22_000_000 - 40_200_000
+    )
+    device_us[2000:] = (device_us[2000:] - device_us[2000]) % WRAP_US + 8_000_000
+    receive_ns[2000:] += 60 * S
+    true_ns[2000:] += 60 * S
+    error_ns = np.abs(follow(DeviceClock(), device_us, receive_ns) - true_ns)
+    assert np.percentile(error_ns, 99) < 1 * MS
+
+
 def test_the_clock_is_kept_through_an_outage_longer_than_a_wrap() -> None:
     device_us, receive_ns, true_ns = deliveries(np.random.default_rng(5), 3000)
     gap_ns = 2 * 3600 * S

@@ -84,9 +84,21 @@ def test_a_head_inside_of_a_payload_is_no_head() -> None:
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-@pytest.mark.parametrize("flood", [b"\x02", b"s", 4 * b"\x02" + b"\x00\x00\xff\xf0s", b"\x02s", bytes(range(256))])
-def test_no_stream_fills_the_memory(dialect: Dialect, flood: bytes) -> None:
+@pytest.mark.parametrize(
+    ("first", "flood"),
+    [
+        (b"", b"\x02"),
+        (b"", b"s"),
+        (b"", b"\x02s"),
+        (b"\x02", b"s"),  # a text that does not end
+        (b"", bytes(range(256))),
+        (b"", 4 * b"\x02" + b"\x00\x00\xff\xf0s"),
+        (4 * b"\x02" + b"\x7f\xff\xff\xff", b"s"),  # a length of 2 GB
+    ],
+)
+def test_no_stream_fills_the_memory(dialect: Dialect, first: bytes, flood: bytes) -> None:
     receiver = Receiver(dialect)
+    receiver.feed(first)
     piece = flood * (8192 // len(flood))
     for _ in range(40):
         receiver.feed(piece)

@@ -4,6 +4,7 @@ import json
 import struct
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +235,20 @@ def test_impossible_counts_are_refused(dialect: Dialect) -> None:
     assert encoders != payload
     with pytest.raises(ColaError, match="65535"):
         decode(dialect, encoders)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"1  3", b"1 2 3x", b"1 2 10000", b"1 2 100000", b"1 2 \t\t12", b"1 2 0x3", b"1 2 +3", b"1 2", b"1 2 \xff3"],
+)
+def test_bad_values_of_cola_a(data: bytes) -> None:
+    scan = ScanData(1, 1, 1, (0, 0), 1, 1, 1, 1, (0, 0), (0, 0), 0, 5000, 360, (), (), ())
+    channel = Channel("DIST1", 1.0, 0.0, 0, 5000, np.array([1, 2, 3], np.uint16))
+    (payload,) = Receiver(Dialect.A).feed(encode_scan_data(Dialect.A, replace(scan, channels16=(channel,))))
+    head, tail = payload.split(b" 1 2 3 ")
+    assert isinstance(decode(Dialect.A, head + b" 1 02 0003 " + tail), ScanData)
+    with pytest.raises(ColaError):
+        decode(Dialect.A, head + b" " + data + b" " + tail)
 
 
 # The captured session

@@ -147,14 +147,15 @@ def test_the_captured_session(open_peer: OpenPeer) -> None:
     assert written == [Command("sWN LMDscandatacfg", (1, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 1))]  # all else is as wanted
 
 
-def scan_telegram() -> bytes:
+def scan_telegrams(*which: int) -> bytes:
     raw = (CAPTURES / "colab_dev2host.bin").read_bytes()
-    return frame(Dialect.B, next(p for p in Receiver(Dialect.B).feed(raw) if p.startswith(b"sSN LMDscandata")))
+    scans = [payload for payload in Receiver(Dialect.B).feed(raw) if payload.startswith(b"sSN LMDscandata")]
+    return b"".join(frame(Dialect.B, scans[k]) for k in which)
 
 
 @needs_captures
 def test_events_between_command_and_reply(open_peer: OpenPeer) -> None:
-    between = scan_telegram() + encode_command(Dialect.B, "sEA LIDinputstate", 1)
+    between = scan_telegrams(0) + encode_command(Dialect.B, "sEA LIDinputstate", 1)
     peer, driver = open_peer({name: between + reply for name, reply in telegrams(REPLIES).items()})
     wait_until(lambda: len(peer.commands) == len(REPLIES))
     wait_until(lambda: driver.connected)
@@ -162,10 +163,25 @@ def test_events_between_command_and_reply(open_peer: OpenPeer) -> None:
 
 
 @needs_captures
-def test_scans_in_one_piece_with_the_registration(open_peer: OpenPeer) -> None:
+@pytest.mark.parametrize(
+    ("sent", "repeated", "lost"),
+    [((0, 1, 2), 0, 0), ((0, 0, 1), 1, 0), ((0, 4), 0, 3), ((4, 0, 1), 0, 0)],  # the last: it counts anew
+)
+def test_scans_in_one_piece_with_the_registration(
+    sent: tuple[int, ...], repeated: int, lost: int, open_peer: OpenPeer
+) -> None:
     replies = telegrams(REPLIES)
-    _, driver = open_peer(replies | {"sEN LMDscandata": replies["sEN LMDscandata"] + scan_telegram()})
-    wait_until(lambda: driver.collect(time.monotonic_ns()).samples)
+    _, driver = open_peer(replies | {"sEN LMDscandata": replies["sEN LMDscandata"] + scan_telegrams(*sent)})
+    counters: list[int] = []
+    wait_until(
+        lambda: (
+            counters.extend(scan.telegram_counter for scan in driver.collect(time.monotonic_ns()).samples)
+            or len(counters) == len(sent) - repeated
+        )
+    )
+    assert counters == [63336 + k for k in dict.fromkeys(sent)]
+    wait_until(lambda: driver.diagnostics["scans repeated"] == str(repeated))
+    assert driver.diagnostics["scans lost"] == str(lost)
 
 
 def test_only_what_differs_is_written(open_peer: OpenPeer) -> None:
