@@ -75,7 +75,7 @@ def test_a_restarted_device_starts_anew() -> None:
 
 
 def test_a_restart_that_looks_like_a_step_ahead() -> None:
-    # The count stood 22 s before its wrap and falls to 8 s, as it would have done in 30 s; the device was away for 60 s.
+    # The count stood 22 s before its wrap and falls to 8 s, as it would have done in 30 s; it was away for 60 s.
     device_us, receive_ns, true_ns = deliveries(
         np.random.default_rng(4), 4000, first_us=WRAP_US - 22_000_000 - 40_200_000
     )
