@@ -1,15 +1,16 @@
 """Edge assembly: where the beacons lie, from the lengths of the drifts and the turns between them (paper, section 2.4).
 
 In: a graph of nodes and edges, the length of each edge, measured turns from one edge to another. Out: positions of the
-nodes. Its law: each edge has one orientation Θ, that of X_j - X_i for its own order (i, j), whichever way it was driven.
+nodes. Its law: an edge has one orientation Θ, that of X_j - X_i for its own order (i, j), whichever way it was driven.
 
     minimise  Σ weight · wrap(Θ_b - Θ_a - turn)²      eq. (6), Θ_e = atan2(X_j - X_i)     eq. (8)
     subject to  ‖X_j - X_i‖ = L_ij for every edge     eq. (7)
 
-Solved by Lagrange-Newton steps on sparse matrices (Gauss-Newton in the turns). A length is held by a spring that is
-stiffened stage by stage, until it is as good as rigid: far from the solution the soft ones let the layout unfold, and
-lengths that contradict each other show themselves, for they stay apart however stiff their springs. Then the compromise
-by the lengths' variances is the answer, and the contradiction is named.
+Where the paper takes an interior-point method, this is the method of multipliers (Hestenes 1969; Nocedal & Wright,
+section 17.3) on sparse Gauss-Newton steps: a spring holds each length, soft at first so that the layout can unfold, then
+stiff, and what is still missing is added to its pull until the length holds. Lengths that contradict each other show
+themselves, for they stay apart however hard the springs pull; then the compromise by the lengths' variances is the
+answer, and the contradiction is named.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
 from processing.geometry import wrap_angle
 
@@ -27,14 +28,15 @@ Ints = NDArray[np.int64]
 
 TURN_STD_RAD = np.radians(1.0)  # of turns and lengths that come without a weight
 LENGTH_STD_M = 0.1
-STAGES = (1e-2, 1e-4, 1e-6, 1e-8)  # of the mean length: by how much a spring gives way
-MAX_STEPS = 30  # of Newton, a stage
+GIVES = (1e-2, 1e-3, 1e-4, *[1e-5] * 20)  # how far the springs that hold the lengths give way, of the mean length
+MAX_STEPS = 50  # of Gauss-Newton, each
+SETTLED_M = 1e-6
 HELD_M = 1e-3  # lengths that hold to this hold
 
 
 @dataclass(frozen=True, slots=True)
 class Assembly:
-    """Where the nodes lie. Each connected part has its own frame: its first node at the origin, its first edge along x."""
+    """Where the nodes lie. Each connected part has its frame: its first node at the origin, its first edge along x."""
 
     positions: Array  # (n, 2) m
     parts: Ints  # (n,) number of the connected part of each node
@@ -116,25 +118,29 @@ def _in_own_frame(positions: Array, first_edge: Ints) -> Array:
 
 
 def _solve(part: _Part, variances: Array) -> _Solution:
-    positions, iterations, unit = _first_guess(part), 0, part.lengths.mean()
-    last_gap = np.inf
-    for stage in STAGES:
-        rigid = np.full(len(part.lengths), (stage * unit) ** 2)
-        positions, steps, converged = _minimise(part, positions, rigid, 1e-12 if stage == STAGES[-1] else 1e-2)
+    positions, offsets, last_gap, iterations = _first_guess(part), np.zeros(len(part.lengths)), np.inf, 0
+    for give in GIVES:
+        springs = np.full(len(part.lengths), (give * part.lengths.mean()) ** 2)
+        positions, steps, converged = _minimise(part, positions, springs, offsets, 1e-6)
+        gaps = _residuals(part, positions)[1]
         iterations += steps
-        gaps = np.abs(_residuals(part, positions)[1])
-        if gaps.max() > max(last_gap / 2, HELD_M):  # stiffer springs do not close them: there is no such layout
-            positions, steps, converged = _minimise(part, positions, variances, 1e-12)
-            return _Solution(positions, np.flatnonzero(gaps > HELD_M), iterations + steps, converged)
-        last_gap = gaps.max()
-    return _Solution(positions, np.flatnonzero(gaps > HELD_M), iterations, converged)
+        gap = np.abs(gaps).max()
+        if gap > max(0.8 * last_gap, HELD_M):  # pulling harder does not close them: there is no such layout
+            positions, steps, converged = _minimise(part, positions, variances, 0 * offsets, 1e-9)
+            return _Solution(positions, np.flatnonzero(np.abs(gaps) > HELD_M), iterations + steps, converged)
+        if gap < SETTLED_M:
+            break
+        last_gap = gap
+        if give == GIVES[-1]:
+            offsets = offsets + gaps
+    return _Solution(positions, np.flatnonzero(np.abs(gaps) > HELD_M), iterations, converged)
 
 
 def _first_guess(part: _Part) -> Array:
     """Orientations along a spanning tree of the turns, then least squares on turns and on edges as vectors.
 
-    Edges that no chain of turns joins form groups; the groups turn against each other so that the edges close best: with
-    nodes and turns r of the groups as complex numbers, z_j - z_i = L exp(iΘ) r is linear.
+    Edges that no chain of turns joins form groups; the groups turn against each other so that the edges close best:
+    with nodes and turns r of the groups as complex numbers, z_j - z_i = L exp(iΘ) r is linear.
     """
     m, n = len(part.lengths), int(part.edges.max()) + 1
     angles, groups = _spread_turns(part)
@@ -150,7 +156,7 @@ def _first_guess(part: _Part) -> Array:
     # a group that hangs on one node may turn freely: it stays as it is
     prior = np.r_[np.zeros(n - 1), np.full(groups.max(), 1e-6 * unit**2)]
     normal = (design.conj().T @ design + sparse.diags_array(prior)).tocsc()
-    solved = _factorise(normal.astype(complex)).solve(design.conj().T @ wanted + prior)
+    solved = _solve_normal(normal, design.conj().T @ wanted + prior)
     z = np.r_[0, solved[: n - 1]]
     return np.column_stack([z.real, z.imag])
 
@@ -177,7 +183,7 @@ def _spread_turns(part: _Part) -> tuple[Array, Ints]:
     left = wrap_angle(part.turn_angles - (angles[b] - angles[a]))
     free = np.setdiff1d(np.arange(m), first)
     weighted = sparse.diags_array(part.weights) @ design[:, free]
-    angles[free] += _factorise((design[:, free].T @ weighted).tocsc()).solve(weighted.T @ left)
+    angles[free] += _solve_normal(design[:, free].T @ weighted, weighted.T @ left)
     return angles, groups.astype(np.int64)
 
 
@@ -204,44 +210,44 @@ def _jacobians(part: _Part, positions: Array) -> tuple[sparse.csr_array, sparse.
     return of_angles[part.turn_edges[:, 1]] - of_angles[part.turn_edges[:, 0]], of_lengths
 
 
-def _minimise(part: _Part, positions: Array, variances: Array, tolerance: float) -> tuple[Array, int, bool]:
-    """½ Σ weight · turn² + ½ Σ (length gap)² / variance: the layout, the steps taken, whether it settled.
+def _minimise(
+    part: _Part, positions: Array, variances: Array, offsets: Array, tolerance: float
+) -> tuple[Array, int, bool]:
+    """½ Σ weight · turn² + ½ Σ (length gap + offset)² / variance: the layout, the steps taken, whether it settled.
 
-    Each step solves [H Aᵀ; A -D] [dx; λ] = [-g; -gaps] with D the variances: λ is the force in each edge, and D may go to
-    zero, which is the Lagrange-Newton step of the rigid problem.
+    Gauss-Newton, damped where a step does not pay. The damping also holds what nothing else holds: the place of the
+    whole, and edges that hang free on a node.
     """
 
     def cost(at: Array) -> float:
         turns, gaps = _residuals(part, at)
-        return float(part.weights @ turns**2 + np.sum(gaps**2 / variances)) / 2
+        return float(part.weights @ turns**2 + np.sum((gaps + offsets) ** 2 / variances)) / 2
 
-    unit, damping, now = float(part.lengths.mean()), 1e-6, cost(positions)
+    unit, damping, now = part.lengths.mean(), 1e-6, cost(positions)
     for step in range(1, MAX_STEPS + 1):
         turns, gaps = _residuals(part, positions)
         of_turns, of_lengths = _jacobians(part, positions)
-        weighted = sparse.diags_array(part.weights) @ of_turns
-        hessian = of_turns.T @ weighted
-        scale = max(hessian.diagonal().mean(), unit**-2)
-        hessian = hessian + sparse.diags_array(np.full(positions.size, damping * scale))  # nor drift, nor free hinges
-        system = sparse.block_array([[hessian, of_lengths.T], [of_lengths, sparse.diags_array(-variances)]]).tocsc()
-        solved = _factorise(system).solve(np.concatenate([-(weighted.T @ turns), -gaps]))
-        move, part_of_it = solved[: positions.size].reshape(-1, 2), 1.0
-        if np.abs(move).max() < 1e-9 * unit:
+        pull, push = of_turns.T * part.weights, of_lengths.T / variances
+        normal = pull @ of_turns + push @ of_lengths
+        scale = max((pull @ of_turns).diagonal().mean(), unit**-2)
+        normal = normal + sparse.diags_array(np.full(positions.size, damping * scale))
+        move = -_solve_normal(normal, pull @ turns + push @ (gaps + offsets)).reshape(-1, 2)
+        if np.abs(move).max() < SETTLED_M:
             return positions, step, True
-        while (after := cost(positions + part_of_it * move)) > now and part_of_it > 1e-3:
-            part_of_it /= 2
+        share = 1.0
+        while (after := cost(positions + share * move)) > now and share > 1e-3:
+            share /= 2
         if after > now:
-            if damping > 1e3:
-                return positions, step, np.abs(move).max() < 1e-6 * unit
             damping *= 100
             continue
-        settled = now - after <= tolerance * (now + tolerance) and part_of_it == 1
-        positions, now, damping = positions + part_of_it * move, after, max(damping / 100, 1e-9)
+        settled = now - after <= tolerance * now and share == 1
+        positions, now, damping = positions + share * move, after, max(damping / 100, 1e-9)
         if settled:
             return positions, step, True
     return positions, MAX_STEPS, False
 
 
-def _factorise(matrix: sparse.csc_array) -> SuperLU:
-    """LU of a symmetric matrix, the order of elimination by its pattern: a tenth of the fill of the default's."""
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1, options={"SymmetricMode": True})
+def _solve_normal(matrix: sparse.csc_array, right: Array) -> Array:
+    """Positive definite normal equations: order of elimination by the pattern, no pivots, a tenth of the usual fill."""
+    factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factors.solve(right)

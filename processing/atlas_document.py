@@ -77,7 +77,7 @@ def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[
     of = piece.solved.input.piece
     kind = "edge" if of.j is not None else "spurs" if of.i is not None else "run"
     chord = placement.nodes[of.j] - placement.nodes[of.i] if of.i is not None and of.j is not None else None
-    links = piece.solved.map.links
+    strong = strong_links(piece)
     return {
         "id": piece.solved.input.name,
         "kind": kind,
@@ -87,7 +87,7 @@ def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[
         "part": piece.part,
         "frame": [_metres(value) for value in piece.frame],
         "poses": len(piece.edge_poses),
-        "links": {"weak": int((~links.robust).sum()), "strong": int(links.robust.sum())},
+        "links": {"weak": int((~strong).sum()), "strong": int(strong.sum())},
         "paths": [
             {
                 "run": runs[span.run].run.run_id,
@@ -98,6 +98,11 @@ def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[
             for span in of.spans
         ],
     }
+
+
+def strong_links(piece: Placed) -> NDArray[np.bool_]:
+    """Which links join poses that are not neighbours on a path."""
+    return np.asarray(np.diff(piece.solved.map.links.ends, axis=1)[:, 0] != 1)
 
 
 def _arrays(piece: Placed, runs: list["DrivenRun"], grid: Grid) -> dict[str, NDArray[Any]]:
@@ -114,7 +119,7 @@ def _arrays(piece: Placed, runs: list["DrivenRun"], grid: Grid) -> dict[str, NDA
         "link_ends": solved.map.links.ends,
         "link_motions": solved.map.links.motions,
         "link_informations": solved.map.links.informations,
-        "link_strong": solved.map.links.robust,
+        "link_strong": strong_links(piece),
         "link_squared_distances": solved.map.solution.squared_distances,
         "grid_log_odds": grid.log_odds,
         "grid_resolution": np.array(grid.resolution_m),

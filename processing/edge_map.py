@@ -110,7 +110,14 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
             astray = drift.radius_m > 1.0 or drift.radius_rad > 0.2
             found = match_pairs(frames, poses, pairs, SEARCH_INLIERS if astray else LOOP_INLIERS)
             if astray and len(found) < 0.3 * len(pairs):
-                found = match_pairs(frames, poses, pairs[:: max(1, len(pairs) // SEARCHES)], SEARCH_INLIERS, drift.radius_m, drift.radius_rad)
+                found = match_pairs(
+                    frames,
+                    poses,
+                    pairs[:: max(1, len(pairs) // SEARCHES)],
+                    SEARCH_INLIERS,
+                    drift.radius_m,
+                    drift.radius_rad,
+                )
             present[stretch] = True
             if len(found) or stretch[0] == firsts[path]:
                 loops = loops + found

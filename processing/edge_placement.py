@@ -210,7 +210,7 @@ def _settle(
         parts_of_nodes[node] = homes[0]
         if len(set(homes.tolist())) > 1:
             notes.append(f"passes of {graph.nodes[node].epc} could not be joined: the map has a part for each")
-    shifts = _side_by_side(bent, parts)
+    shifts = lay_side_by_side([piece.map.poses for piece in bent], parts)
     nodes[:, 0] += shifts[parts_of_nodes]
     placed = []
     for piece, part in zip(bent, parts, strict=True):
@@ -231,11 +231,11 @@ def edge_frame(piece: SolvedPiece, nodes: Array, poses: Array) -> Array:
     return np.array([*nodes[i, :2], np.arctan2(*(nodes[j, :2] - nodes[i, :2])[::-1])])
 
 
-def _side_by_side(pieces: list[SolvedPiece], parts: list[int]) -> Array:
-    """How far to move each part along x so that none covers another."""
+def lay_side_by_side(poses: list[Array], parts: list[int]) -> Array:
+    """How far to move each part along x so that none covers another; `poses` (N, 3) and part of every piece."""
     shifts, edge = np.zeros(max(parts, default=0) + 1), None
     for part in range(len(shifts)):
-        x = np.concatenate([piece.map.poses[:, 0] for piece, of in zip(pieces, parts, strict=True) if of == part])
+        x = np.concatenate([of_piece[:, 0] for of_piece, of in zip(poses, parts, strict=True) if of == part])
         if edge is not None:
             shifts[part] = edge + PART_GAP_M - x.min()
         edge = x.max() + shifts[part] + PART_GAP_M

@@ -23,18 +23,28 @@ from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass, find_passes, overlapping_passes
 from processing.edge_placement import Placed, Placement, place_by_frames
 from processing.graph import Piece, build_graph
+from processing.length_placement import place_by_lengths
 from processing.occupancy_grid import Grid
 from processing.odometry import dead_reckon
 from processing.open_loop import OpenLoop, estimate_open_loop, mount_pose, odometry_at_scans
 from processing.pieces import PieceInput, cut_span, draw_piece, solve_piece
+from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
-from processing.scan_matching import Matcher, match_scans
+from processing.scan_match import ScanMatch
+from processing.scan_matching import Matcher, Scan, match_scans
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans}
+
+def match_polar_scans(reference: Scan, current: Scan, guess: Array) -> ScanMatch:
+    """Polar scan matching on scans as the other stages keep them."""
+    angles = reference.angle_min + reference.angle_increment * np.arange(len(reference.points), dtype=np.float64)
+    return match_polar(np.hypot(*reference.points.T), np.hypot(*current.points.T), angles, guess)
+
+
+MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans, "psm": match_polar_scans}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +73,8 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, jobs:
     graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
     inputs = [piece_input(piece, runs) for piece in graph.pieces]
     solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
-    placed = place_by_frames(solved, graph, match)
+    place = place_by_frames if config.assembly == "refined" else place_by_lengths
+    placed = place(solved, graph, match)
     grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
     return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed))
 

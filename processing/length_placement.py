@@ -1,0 +1,119 @@
+"""Assembly as the paper has it (section 2.4): edges keep their lengths, turns between them are fitted best.
+
+In: solved pieces. Out: a `Placement`. Every edge is put into its own frame, with the first pose of its first path at
+the origin and the last on the x-axis; each drive from one edge into the next measures how one frame is turned against
+the other. What error the edges have gathered shows as kinks at the nodes: pieces are not bent to fit.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.assembly import Assembly, assemble_paper, turn_from_headings
+from processing.edge_placement import Placed, Placement, find_boundary, lay_side_by_side, link_nodes
+from processing.geometry import compose, inverse, relative
+from processing.graph import Graph
+from processing.pieces import SolvedPiece
+from processing.scan_matching import Matcher
+
+Array = NDArray[np.float64]
+
+
+def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher) -> Placement:
+    """The paper's assembly of all edges; spurs are hung on the edges that they share a pass with."""
+    edges = [p for p, piece in enumerate(solved) if piece.input.piece.j is not None]
+    local = [relative(_own_frame(piece), piece.map.poses) for piece in solved]
+    assembly = _assemble(solved, edges, local, graph)
+    frames, parts = [np.zeros(3) for _ in solved], [-1 for _ in solved]
+    passes: dict[tuple[int, int], tuple[Array, int]] = {}  # (run, scan) → pose in the atlas, part
+    for p in edges:
+        i, j = (assembly.positions[node] for node in _nodes_of(solved[p]))
+        frames[p] = np.array([*i, np.arctan2(*(j - i)[::-1])])
+        parts[p] = int(assembly.parts[_nodes_of(solved[p])[0]])
+        for key, _, index in _passes_of(solved[p]):
+            passes.setdefault(key, (compose(frames[p], local[p][index]), parts[p]))
+    for p in range(len(solved)):
+        if p in edges:
+            continue
+        shared = [(*passes[key], index) for key, _, index in _passes_of(solved[p]) if key in passes]
+        if shared:
+            pose, parts[p], index = shared[0]
+            frames[p] = compose(pose, inverse(local[p][index]))
+        else:
+            parts[p] = len(graph.nodes) + p  # a part of its own
+    parts = np.unique(parts, return_inverse=True)[1].tolist()
+    shifts = lay_side_by_side([compose(frame, poses) for frame, poses in zip(frames, local, strict=True)], parts)
+    placed = [
+        Placed(piece, frames[p] + np.array([shifts[parts[p]], 0.0, 0.0]), local[p], parts[p])
+        for p, piece in enumerate(solved)
+    ]
+    nodes, node_parts = np.zeros((len(graph.nodes), 3)), np.full(len(graph.nodes), -1)
+    for of in sorted(placed, key=lambda piece: piece.solved.input.piece.j is None):  # edges have the say on their nodes
+        for _, node, index in _passes_of(of.solved):
+            if node_parts[node] < 0:
+                nodes[node], node_parts[node] = of.poses[index], of.part
+    return Placement(placed, nodes, node_parts, _remarks(solved, edges, assembly))
+
+
+def _nodes_of(edge: SolvedPiece) -> tuple[int, int]:
+    i, j = edge.input.piece.i, edge.input.piece.j
+    assert i is not None
+    assert j is not None  # it is an edge
+    return i, j
+
+
+def _own_frame(piece: SolvedPiece) -> Array:
+    """The frame of a piece, in that of its poses; of an edge, from the first path's pass of i to that of j (figure
+    6c).
+    """
+    if piece.input.piece.j is None:
+        return piece.map.poses[0]
+    a, b = piece.ends(0)
+    if piece.input.piece.spans[0].start != piece.input.piece.i:
+        a, b = b, a
+    origin, end = piece.map.poses[a], piece.map.poses[b]
+    return np.array([origin[0], origin[1], np.arctan2(end[1] - origin[1], end[0] - origin[0])])
+
+
+def _passes_of(piece: SolvedPiece) -> list[tuple[tuple[int, int], int, int]]:
+    """(run, scan), node and pose of every pass that ends a path of the piece."""
+    out = []
+    for k, span in enumerate(piece.input.piece.spans):
+        for index, scan, node in zip(piece.ends(k), (span.first, span.last), (span.start, span.end), strict=True):
+            if node is not None:
+                out.append(((span.run, scan), node, index))
+    return out
+
+
+def _assemble(solved: list[SolvedPiece], edges: list[int], local: list[Array], graph: Graph) -> Assembly:
+    ends = np.array([_nodes_of(solved[p]) for p in edges], np.int64).reshape(-1, 2)
+    lengths = []
+    headings: dict[tuple[int, int], list[tuple[int, float]]] = {}
+    for number, p in enumerate(edges):
+        a, b = solved[p].ends(0)
+        lengths.append(float(np.hypot(*(local[p][b, :2] - local[p][a, :2]))))
+        for key, _, index in _passes_of(solved[p]):
+            headings.setdefault(key, []).append((number, local[p][index, 2]))
+    # A drive from one edge into the next: the pass is one pose, seen from both edges, and δ of eq. 5 is zero.
+    joints = [(key, key, 0.0) for key, pair in headings.items() if len(pair) == 2]
+    # Passes that no drive joins: δ is what their scans say.
+    boundary = find_boundary(solved)
+    key_of = {variable: key for key, variable in boundary.passes.items()}
+    links = link_nodes(solved, boundary)
+    for (u, v), motion in zip(links.ends.tolist(), links.motions, strict=True):
+        joints.append((key_of[u], key_of[v], float(motion[2])))
+    turns = [
+        (a, b, float(turn_from_headings(alpha, delta, beta)))
+        for first, second, delta in joints
+        for a, alpha in headings.get(first, [])[:1]
+        for b, beta in headings.get(second, [])[-1:]
+        if a != b
+    ]
+    turn_edges = np.array([(a, b) for a, b, _ in turns], np.int64).reshape(-1, 2)
+    return assemble_paper(len(graph.nodes), ends, np.array(lengths), turn_edges, np.array([t for _, _, t in turns]))
+
+
+def _remarks(solved: list[SolvedPiece], edges: list[int], assembly: Assembly) -> list[str]:
+    if not assembly.violated:
+        return []
+    names = ", ".join(solved[edges[e]].input.name for e in assembly.violated)
+    return [f"the lengths of edges {names} cannot all hold in the plane; the assembly stretches them"]
