@@ -27,8 +27,8 @@ from rtlog_server.messages import encode
 from rtlog_server.topics import BY_NAME, DIAGNOSTICS, zenoh_key
 
 HEARTBEAT_S = 1.0
-# How long a put waits for a congested link before it drops. With the default of 1 ms a subscriber that is well lost 5 % of a
-# burst of 12,000 samples (40 % on a loaded board), with 5 ms none; one that stands still costs 20 ms a tick.
+# How long a put waits for a congested link before it drops. With the default of 1 ms a subscriber that is well lost
+# 5 % of a burst of 12,000 samples (40 % on a loaded board), with 5 ms none; one that stands still costs 20 ms a tick.
 WAIT_BEFORE_DROP_US = 5000
 
 
