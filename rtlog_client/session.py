@@ -1,4 +1,4 @@
-"""The laptop's end of zenoh: find the server, ask it, listen to it. Only this file of the package imports zenoh.
+"""The laptop's end of zenoh: find the server, ask it, listen to it. Only this file and republish.py know zenoh.
 
 In: an endpoint. Out: `Arrived`, `Heartbeat` and `Presence` in a queue, in order of arrival. The law: zenoh's threads
 only enqueue. What finds the queue full is dropped here, and its sequence number is missed like any other.
@@ -121,10 +121,13 @@ class Link:
             put(Presence(UUID(str(sample.key_expr).rsplit("/", 1)[1]), sample.kind == zenoh.SampleKind.PUT))
 
         # `**` does not match chunks that start with @. The topics come first: a heartbeat proves that they work.
-        server = self._session.liveliness().declare_subscriber(f"{prefix}@server/*", presence, history=True)
-        topics = self._session.declare_subscriber(f"{prefix}**", arrived)
-        beats = self._session.declare_subscriber(f"{prefix}@heartbeat", heartbeat)
-        self._subscribers = [server, topics, beats]
+        # Direct: by default each subscriber calls back from a thread of its own, and a heartbeat overtakes samples.
+        direct = [zenoh.handlers.Callback(function, indirect=False) for function in (presence, arrived, heartbeat)]
+        self._subscribers = [
+            self._session.liveliness().declare_subscriber(f"{prefix}@server/*", direct[0], history=True),
+            self._session.declare_subscriber(f"{prefix}**", direct[1]),
+            self._session.declare_subscriber(f"{prefix}@heartbeat", direct[2]),
+        ]
 
     def unsubscribe(self) -> None:
         """After this, nothing more comes into the inbox."""
