@@ -7,10 +7,10 @@ nodes. Its law: an edge has one orientation Θ, that of X_j - X_i for its own or
     subject to  ‖X_j - X_i‖ = L_ij for every edge     eq. (7)
 
 Where the paper takes an interior-point method, this is the method of multipliers (Hestenes 1969; Nocedal & Wright,
-section 17.3) on sparse Gauss-Newton steps: a spring holds each length, soft at first so that the layout can unfold, then
-stiff, and what is still missing is added to its pull until the length holds. Lengths that contradict each other show
-themselves, for they stay apart however hard the springs pull; then the compromise by the lengths' variances is the
-answer, and the contradiction is named.
+section 17.3) on sparse least squares: a spring holds each length, soft at first so that the layout can unfold,
+then stiff, and what is still missing is added to its pull until the length holds. Lengths that contradict each other
+show themselves, for they stay apart however hard the springs pull; then the compromise by the lengths' variances is
+the answer, and the contradiction is named.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ Ints = NDArray[np.int64]
 TURN_STD_RAD = np.radians(1.0)  # of turns and lengths that come without a weight
 LENGTH_STD_M = 0.1
 GIVES = (1e-2, 1e-3, 1e-4, *[1e-5] * 20)  # how far the springs that hold the lengths give way, of the mean length
-MAX_STEPS = 50  # of Gauss-Newton, each
+MAX_STEPS = 50  # of Levenberg-Marquardt, for each
 SETTLED_M = 1e-6
 HELD_M = 1e-3  # lengths that hold to this hold
 
@@ -127,13 +127,18 @@ def _solve(part: _Part, variances: Array) -> _Solution:
         gap = np.abs(gaps).max()
         if gap > max(0.8 * last_gap, HELD_M):  # pulling harder does not close them: there is no such layout
             positions, steps, converged = _minimise(part, positions, variances, 0 * offsets, 1e-9)
-            return _Solution(positions, np.flatnonzero(np.abs(gaps) > HELD_M), iterations + steps, converged)
+            return _Solution(positions, _worst_first(gaps), iterations + steps, converged)
         if gap < SETTLED_M:
             break
         last_gap = gap
         if give == GIVES[-1]:
             offsets = offsets + gaps
-    return _Solution(positions, np.flatnonzero(np.abs(gaps) > HELD_M), iterations, converged)
+    return _Solution(positions, _worst_first(gaps), iterations, converged)
+
+
+def _worst_first(gaps: Array) -> Ints:
+    order = np.argsort(-np.abs(gaps), kind="stable")
+    return order[np.abs(gaps)[order] > HELD_M]
 
 
 def _first_guess(part: _Part) -> Array:
@@ -196,7 +201,7 @@ def _residuals(part: _Part, positions: Array) -> tuple[Array, Array]:
 
 
 def _jacobians(part: _Part, positions: Array) -> tuple[sparse.csr_array, sparse.csr_array]:
-    """Of the turns (t, 2n) and the lengths (m, 2n); columns x0, y0, x1, y1 …"""
+    """Of the edges' orientations and lengths, each (m, 2n); columns x0, y0, x1, y1 …"""
     m, n = len(part.lengths), len(positions)
     i, j = part.edges[:, 0], part.edges[:, 1]
     d = positions[j] - positions[i]
@@ -207,7 +212,7 @@ def _jacobians(part: _Part, positions: Array) -> tuple[sparse.csr_array, sparse.
     of_lengths = sparse.csr_array((np.concatenate([-ux, -uy, ux, uy]), (rows, columns)), shape=(m, 2 * n))
     swing = np.concatenate([uy / length, -ux / length, -uy / length, ux / length])  # of atan2
     of_angles = sparse.csr_array((swing, (rows, columns)), shape=(m, 2 * n))
-    return of_angles[part.turn_edges[:, 1]] - of_angles[part.turn_edges[:, 0]], of_lengths
+    return of_angles, of_lengths
 
 
 def _minimise(
@@ -215,8 +220,8 @@ def _minimise(
 ) -> tuple[Array, int, bool]:
     """½ Σ weight · turn² + ½ Σ (length gap + offset)² / variance: the layout, the steps taken, whether it settled.
 
-    Gauss-Newton, damped where a step does not pay. The damping also holds what nothing else holds: the place of the
-    whole, and edges that hang free on a node.
+    Levenberg-Marquardt: damped the more the less a step pays. The damping also holds what nothing else holds: the place
+    of the whole, and edges that hang free on a node.
     """
 
     def cost(at: Array) -> float:
@@ -226,7 +231,8 @@ def _minimise(
     unit, damping, now = part.lengths.mean(), 1e-6, cost(positions)
     for step in range(1, MAX_STEPS + 1):
         turns, gaps = _residuals(part, positions)
-        of_turns, of_lengths = _jacobians(part, positions)
+        of_angles, of_lengths = _jacobians(part, positions)
+        of_turns = of_angles[part.turn_edges[:, 1]] - of_angles[part.turn_edges[:, 0]]
         pull, push = of_turns.T * part.weights, of_lengths.T / variances
         normal = pull @ of_turns + push @ of_lengths
         scale = max((pull @ of_turns).diagonal().mean(), unit**-2)
@@ -234,14 +240,12 @@ def _minimise(
         move = -_solve_normal(normal, pull @ turns + push @ (gaps + offsets)).reshape(-1, 2)
         if np.abs(move).max() < SETTLED_M:
             return positions, step, True
-        share = 1.0
-        while (after := cost(positions + share * move)) > now and share > 1e-3:
-            share /= 2
+        after = cost(positions + move)
         if after > now:
-            damping *= 100
+            damping *= 10
             continue
-        settled = now - after <= tolerance * now and share == 1
-        positions, now, damping = positions + share * move, after, max(damping / 100, 1e-9)
+        settled = now - after <= tolerance * now
+        positions, now, damping = positions + move, after, max(damping / 10, 1e-9)
         if settled:
             return positions, step, True
     return positions, MAX_STEPS, False
