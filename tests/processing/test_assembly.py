@@ -96,9 +96,19 @@ def test_nested_loops_from_perfect_measurements() -> None:
 def test_noise_spreads_over_the_loops() -> None:
     network = grid(8, noise_rad=0.02)
     assembly = laid_out(network)
-    assert np.abs(gaps(assembly, network)).max() < 1e-5
+    assert np.abs(gaps(assembly, network)).max() < 1e-6
     assert error(assembly, network) < 1.0
     assert np.sqrt(turn_cost(assembly.positions, network) / len(network[4])) < 0.02
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_poor_turns_do_not_fold_the_layout(seed: int) -> None:
+    """12 degrees of noise in every turn: along a spanning tree they add up to a layout that is folded over."""
+    network = grid(20, noise_rad=0.2, seed=seed)
+    assembly = laid_out(network)
+    assert assembly.converged
+    assert assembly.violated == []
+    assert error(assembly, network) < 20
 
 
 @pytest.mark.filterwarnings("ignore:delta_grad:UserWarning")  # the oracle's, at its end
