@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from processing.geometry import wrap_angle
@@ -142,7 +142,7 @@ def _worst_first(gaps: Array) -> Ints:
 
 
 def _first_guess(part: _Part) -> Array:
-    """Orientations along a spanning tree of the turns, then least squares on turns and on edges as vectors.
+    """Least squares on the turns, then on the edges as vectors.
 
     Edges that no chain of turns joins form groups; the groups turn against each other so that the edges close best:
     with nodes and turns r of the groups as complex numbers, z_j - z_i = L exp(iΘ) r is linear.
@@ -167,29 +167,30 @@ def _first_guess(part: _Part) -> Array:
 
 
 def _spread_turns(part: _Part) -> tuple[Array, Ints]:
-    """Orientations (m,) of the edges that fit the turns best, and the group (m,) of edges that turns join."""
-    m = len(part.lengths)
-    n_groups, groups = connected_components(_adjacency(m, part.turn_edges), directed=False)
-    first = np.full(n_groups, -1)
-    first[groups[::-1]] = np.arange(m)[::-1]
-    if not len(part.turn_angles):
-        return np.zeros(m), groups.astype(np.int64)
-    a, b = part.turn_edges[:, 0], part.turn_edges[:, 1]
-    angles, turns = np.zeros(m), {}
-    for i, j, turn in zip(a.tolist(), b.tolist(), part.turn_angles.tolist(), strict=True):
-        turns[i, j], turns[j, i] = turn, -turn
-    both_ways = _adjacency(m, np.vstack([part.turn_edges, part.turn_edges[:, ::-1]]))
-    for start in first:
-        order, before = breadth_first_order(both_ways, start, directed=False)
-        for edge in order[1:].tolist():
-            angles[edge] = angles[before[edge]] + turns[int(before[edge]), edge]
-    rows = np.arange(len(a))
-    design = sparse.csc_array((np.r_[np.ones(len(a)), -np.ones(len(a))], (np.r_[rows, rows], np.r_[b, a])), (len(a), m))
-    left = wrap_angle(part.turn_angles - (angles[b] - angles[a]))
+    """Orientations (m,) of the edges that fit the turns best, and the group (m,) of edges that turns join.
+
+    First as complex numbers, exp(iΘ_b) = exp(i turn) exp(iΘ_a), which is linear and knows no wrapping; this tells the
+    whole turns. Then as angles, whose least squares are those of eq. (6).
+    """
+    m, (a, b) = len(part.lengths), part.turn_edges.T
+    _, groups = connected_components(_adjacency(m, part.turn_edges), directed=False)
+    _, first = np.unique(groups, return_index=True)
     free = np.setdiff1d(np.arange(m), first)
-    weighted = sparse.diags_array(part.weights) @ design[:, free]
-    angles[free] += _solve_normal(design[:, free].T @ weighted, weighted.T @ left)
-    return angles, groups.astype(np.int64)
+    if not len(free):
+        return np.zeros(m), groups.astype(np.int64)
+    rows, ones = np.tile(np.arange(len(a)), 2), np.ones(len(a))
+
+    def fit(of_a: Array, fixed: Array, wanted: Array) -> Array:
+        design = sparse.csc_array((np.r_[ones, -of_a], (rows, np.r_[b, a])), shape=(len(a), m))
+        pull = design[:, free].conj().T * part.weights
+        fixed[free] += _solve_normal(pull @ design[:, free], pull @ (wanted - design @ fixed))
+        return fixed
+
+    pinned = np.zeros(m, complex)
+    pinned[first] = 1
+    angles = np.angle(fit(np.exp(1j * part.turn_angles), pinned, 0 * ones))
+    left = wrap_angle(part.turn_angles - (angles[b] - angles[a]))
+    return angles + fit(ones, np.zeros(m), left), groups.astype(np.int64)
 
 
 def _residuals(part: _Part, positions: Array) -> tuple[Array, Array]:
