@@ -178,7 +178,7 @@ def test_projection_hides_what_stands_behind_and_what_shows_its_back() -> None:
     labels = label_surfaces(ranges, increment)
     projected = _project(ranges, labels, np.cos(LMS111), np.sin(LMS111), increment, pose)
     behind_panel = np.abs(LMS111) < np.arctan(0.4)
-    beside_panel = (LMS111 > np.arctan(0.6)) & (LMS111 < np.radians(50))
+    beside_panel = (np.degrees(LMS111) > 31) & (np.degrees(LMS111) < 50)
     assert (projected[behind_panel] == 0).all()
     assert_allclose(projected[beside_panel], 5 / np.cos(LMS111[beside_panel]), rtol=1e-9)
 
