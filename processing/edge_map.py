@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry import accumulate
+from processing.geometry import accumulate, relative
 from processing.pose_graph import Links, Solution, solve
 from processing.scan_matching import Matcher, Scan
 from processing.strong_links import (
@@ -35,6 +35,7 @@ SEARCHES = 8  # of a stretch that is astray
 MAX_ROUNDS = 5
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
+TAG_M, TAG_RAD = 3.0, 0.5  # how well a tag alone joins two paths
 DOUBTED = 0.1  # a strong link of less weight is dropped, and may be found again from better poses
 
 
@@ -95,7 +96,12 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
     """Find strong links and solve until they settle. The first pose of the first path stays where it starts."""
     frames, chain, firsts = _join(paths, mount, match)
     poses = np.concatenate([accumulate(path.start, path.chain.motions) for path in paths])
-    links = chain + _wheels(paths, firsts) + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
+    links = (
+        chain
+        + _wheels(paths, firsts)
+        + _joins(paths, firsts)
+        + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
+    )
     loops = links[np.zeros(0, np.int64)]
     count = len(poses)
     present = np.zeros(count, bool)
@@ -181,6 +187,14 @@ def _stretches(frames: KeyFrames, chain: Links, members: Ints) -> list[Ints]:
     covariances = np.linalg.inv(chain.informations[np.isin(chain.ends[:, 1], members[1:])])
     weak = (covariances[:, 0, 0] + covariances[:, 1, 1] > WEAK_M**2) | (covariances[:, 2, 2] > WEAK_RAD**2)
     return np.split(members, np.flatnonzero((np.diff(bins) != 0) | weak) + 1)
+
+
+def _joins(paths: list[Path], firsts: Ints) -> Links:
+    """All that is known without strong links of where a path begins: what its tag says. Keeps the graph in one piece."""
+    ends = np.column_stack([np.zeros(len(paths) - 1, np.int64), firsts[1:-1]])
+    motions = [relative(paths[0].start, path.start) for path in paths[1:]]
+    informations = np.tile(np.diag([TAG_M**-2, TAG_M**-2, TAG_RAD**-2]), (len(motions), 1, 1))
+    return Links.of(ends, np.array(motions), informations, robust=False)
 
 
 def _wheels(paths: list[Path], firsts: Ints) -> Links:

@@ -26,8 +26,8 @@ Ints = NDArray[np.int64]
 
 KEYFRAME_SPACING_M = 0.75
 KEYFRAME_TURN_RAD = 0.35
-MIN_INLIERS = 0.5  # fewer points in common: no match
-ENOUGH_INLIERS = 0.7  # fewer: time for a new key frame
+MIN_INLIERS = 0.6  # fewer of the points that both must see: no match
+ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
 SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
 # What /odom of an unknown robot may be trusted with.
 FOREIGN_NOISE = OdometryNoise(
@@ -156,7 +156,7 @@ class _Chain:
             return False
         fused = fuse(odometry, motion[None], doubt[None], np.array([True]))
         doubt = GATE * covariance if search else fused.covariances[0]  # what had to be searched for may be elsewhere
-        self._arrive(k, fused.deltas[0], doubt, driven, covariance, result.inliers)
+        self._arrive(k, fused.deltas[0], doubt, driven, covariance, result.overlap)
         return True
 
     def coast(self, k: int, step: Array, noise: Array) -> None:
@@ -168,15 +168,15 @@ class _Chain:
         self._arrive(k, compose(self.offset, step), covariance, compose(self.driven, step), driven_covariance, 0.0)
 
     def _arrive(
-        self, k: int, offset: Array, covariance: Array, driven: Array, driven_cov: Array, inliers: float
+        self, k: int, offset: Array, covariance: Array, driven: Array, driven_cov: Array, overlap: float
     ) -> None:
         self.offset, self.covariance = offset, covariance
         self.driven, self.driven_covariance = driven, driven_cov
-        self.reference[k], self.offsets[k], self.matched[k] = len(self.keyframes) - 1, offset, inliers > 0
+        self.reference[k], self.offsets[k], self.matched[k] = len(self.keyframes) - 1, offset, overlap > 0
         self.wants_keyframe = (
             np.hypot(offset[0], offset[1]) > KEYFRAME_SPACING_M
             or abs(offset[2]) > KEYFRAME_TURN_RAD
-            or inliers < ENOUGH_INLIERS
+            or overlap < ENOUGH_OVERLAP
         )
 
 

@@ -5,6 +5,8 @@ vehicle was heading. Both are found by matching the two scans at the passes from
 both ways. Paths that cannot lie in the same drift, though they join the same tags, are told apart here.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -12,12 +14,12 @@ from scipy.spatial import cKDTree
 from processing.geometry import accumulate, compose, inverse
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import Scan, search_match
+from processing.scan_matching import Scan, score, search_match
 
 Array = NDArray[np.float64]
 
 SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
-MIN_INLIERS = 0.5
+MIN_INLIERS = 0.75
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
 
 
@@ -27,9 +29,9 @@ def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch |
     for heading in (0.0, np.pi):
         guess = compose(inverse(mount), compose(np.array([0.0, 0.0, heading]), mount))
         found = search_match(reference, current, guess, SEARCH_M, SEARCH_RAD)
-        if found.converged and found.inliers >= MIN_INLIERS and (best is None or found.inliers > best.inliers):
+        if found.converged and found.inliers >= MIN_INLIERS and (best is None or score(found) > score(best)):
             motion, covariance = through_mount(mount, found.motion, found.covariance)
-            best = ScanMatch(motion, covariance, found.inliers, found.residual_m, True)
+            best = replace(found, motion=motion, covariance=covariance)
     return best
 
 

@@ -20,9 +20,10 @@ class ScanMatch:
 
     motion: Array  # (3,) x [m], y [m], θ [rad]
     covariance: Array  # (3, 3)
-    inliers: float  # 0…1: of the current scan's valid beams, those that found their wall
+    inliers: float  # 0…1: of the current scan's beams that the reference must have seen, those that found their wall
     residual_m: float  # root mean square distance of the inliers from it
     converged: bool
+    overlap: float = 1.0  # 0…1: of all valid beams of the current scan, those that found their wall
 
 
 def through_mount(mount: Array, motions: Array, covariances: Array) -> tuple[Array, Array]:

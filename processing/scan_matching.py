@@ -32,7 +32,8 @@ GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ 
 UNSEEN_VARIANCE = 1e4  # m², rad²: the match says nothing about this direction
 CORRELATION = 2.0  # neighbouring beams share roughness and calibration errors: so many of them count as one
 PRETENCE = 3.0  # information less than so many times what noisy normals pretend is none
-MIN_MATCHED = 10  # points
+MIN_MATCHED = 10  # points, and
+MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
 CLOSEST_M = 0.25  # pairs of points further apart than this are no pairs, once the guess has become good
 SEARCH_TURN_RAD = 0.15
 LEVER_M = 5.0  # a typical distance to the walls
@@ -138,15 +139,16 @@ def _gauss_newton(
     max_iterations: int,
     motion: Array,
     covariance: Array,
-) -> tuple[int, int, float, bool]:
+) -> tuple[int, int, int, float, bool]:
     """Fill motion (3,) and covariance (3, 3).
 
-    Returns: valid points, matched points, rms distance to the line [m], converged.
+    Returns: points on walls, those that the reference must have seen, those that matched, their rms distance to the
+    line [m], converged.
     """
     beams, count = ref_points.shape[0], points.shape[0]
     motion[:] = guess
     converged = False
-    valid = matched = 0
+    valid = visible = matched = 0
     sum_squares = 0.0
     gradient, step = np.zeros(3), np.zeros(3)
     information, false_information = np.zeros((3, 3)), np.zeros((3, 3))
@@ -160,7 +162,7 @@ def _gauss_newton(
         information[:] = 0.0
         false_information[:] = 0.0
         gradient[:] = 0.0
-        valid = matched = 0
+        valid = visible = matched = 0
         sum_squares = sum_weights = 0.0
         for i in range(count):
             if not math.isfinite(normals[i, 0]):
@@ -182,8 +184,14 @@ def _gauss_newton(
                 square = dx * dx + dy * dy
                 if square < best_square and nx * ref_normals[j, 0] + ny * ref_normals[j, 1] > 0.7:
                     best, best_square = j, square
-            if best < 0:
+            if best < 0:  # gone, or never in the reference's sight: beside its field of view, or behind its walls?
+                if (
+                    middle < beams
+                    and not distance > math.hypot(ref_points[middle, 0], ref_points[middle, 1]) + CLOSEST_M
+                ):
+                    visible += 1
                 continue
+            visible += 1
             mx, my = ref_normals[best, 0], ref_normals[best, 1]
             error = mx * (x - ref_points[best, 0]) + my * (y - ref_points[best, 1])
             variance = ref_variances[best, 0] + RANGE_NOISE_M * RANGE_NOISE_M
@@ -202,7 +210,7 @@ def _gauss_newton(
             for a in range(3):
                 for b in range(3):
                     false_information[a, b] += weight * ref_variances[best, 1] * lie[a] * lie[b]
-        if matched < MIN_MATCHED:
+        if matched < max(MIN_MATCHED, MIN_OVERLAP * valid):
             break
         # Directions whose information is mostly pretence are left as the guess has them (Zhang 2016, solution
         # remapping).
@@ -233,7 +241,7 @@ def _gauss_newton(
             converged = moved < 2e-3 and abs(step[2]) < 5e-4
     motion[2] = math.atan2(math.sin(motion[2]), math.cos(motion[2]))
     rms = math.sqrt(sum_squares / sum_weights) if matched else math.inf
-    return valid, matched, rms, converged
+    return valid, visible, matched, rms, converged
 
 
 def match_scans(
@@ -244,7 +252,7 @@ def match_scans(
     `reach_m`: how far off the guess may be; points that find no reference point within it do not count.
     """
     motion, covariance = np.empty(3), np.empty((3, 3))
-    valid, matched, rms, converged = _gauss_newton(
+    valid, visible, matched, rms, converged = _gauss_newton(
         reference.points,
         reference.normals,
         reference.variances,
@@ -260,7 +268,7 @@ def match_scans(
     )
     if not converged:
         motion, covariance = np.array(guess, dtype=np.float64), np.eye(3) * UNSEEN_VARIANCE
-    return ScanMatch(motion, covariance, matched / max(valid, 1), rms, converged)
+    return ScanMatch(motion, covariance, matched / max(visible, 1), rms, converged, matched / max(valid, 1))
 
 
 def search_match(
@@ -268,7 +276,7 @@ def search_match(
 ) -> ScanMatch:
     """The best match from starts spread over a radius around the guess: for guesses too poor for `match_scans` alone.
 
-    Best is the start that lets most points find their wall, and closest among those that find as many.
+    Best is what `score` says.
     """
     shifts = np.arange(-np.ceil(radius_m / reach_m), np.ceil(radius_m / reach_m) + 1) * reach_m
     turns = np.linspace(-radius_rad, radius_rad, 2 * int(np.ceil(radius_rad / SEARCH_TURN_RAD)) + 1)
@@ -279,11 +287,15 @@ def search_match(
                 continue
             for turn in turns:
                 found = match_scans(reference, current, guess + np.array([dx, dy, turn]), reach_m)
-                if best is None or _score(found) > _score(best):
+                if best is None or score(found) > score(best):
                     best = found
     assert best is not None  # the guess itself is always tried
     return best
 
 
-def _score(match: ScanMatch) -> float:
-    return match.inliers - match.residual_m / CLOSEST_M if match.converged else -1.0
+def score(match: ScanMatch) -> float:
+    """How well two scans agree: what matches speaks for it, four times as much what should have and did not against it."""
+    if not match.converged or match.inliers == 0:
+        return -math.inf
+    missing = match.overlap * (1 / match.inliers - 1)
+    return match.overlap - 4 * missing - match.residual_m / CLOSEST_M

@@ -9,7 +9,7 @@ In: key frames with their scans and the poses so far. Out: links. Two kinds of p
               ●──●──●──●
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HOPS_M = (2.0, 4.0, 8.0)
-HOP_INLIERS = 0.15
+HOP_INLIERS = 0.6
 LOOP_RADIUS_M = 2.5  # Δr_max
 LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
-LOOP_INLIERS = 0.35
-SEARCH_INLIERS = 0.6  # a match that had to be searched for must be a better one
+LOOP_INLIERS = 0.6
+SEARCH_INLIERS = 0.75  # a match that had to be searched for must be a better one
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
 
 
@@ -95,7 +95,7 @@ def match_vehicles(
     else:
         found = match(reference, current, scanner_guess)
     motion, covariance = through_mount(mount, found.motion, found.covariance)
-    return ScanMatch(motion, covariance, found.inliers, found.residual_m, found.converged)
+    return replace(found, motion=motion, covariance=covariance)
 
 
 def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
