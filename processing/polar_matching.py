@@ -32,6 +32,7 @@ MAX_DIFFERENCE_M = 1.0  # ranges further apart are of different things
 COARSE_M, FINE_M = 0.7, 0.1  # the weight's c, in the first round and in the last ones
 SEARCH_RAD = math.radians(20)  # the first orientation search to either side; later ones halve it
 MIN_OVERLAP = 0.1  # of the beams: with fewer in common there is no match
+BEHIND_M = 0.25  # what lies farther than this behind the reference's wall was hidden from it
 RANGE_NOISE_M = 0.01  # no residual makes a match surer than the laser is
 UNSEEN_M = 10.0  # standard deviation of a motion that the walls say nothing of
 
@@ -55,11 +56,13 @@ def match_polar(reference_ranges: Array, current_ranges: Array, angles: Array, i
         reference, labels, normals, current, current_labels, cosines, sines, increment, np.array(initial_guess, float)
     )
     projected = _project(current, current_labels, cosines, sines, increment, pose)
-    information, residual, inliers = _normal_equations(reference, labels, normals, projected, cosines, sines, pose)
-    share = inliers / max(1, int(np.count_nonzero(current_labels)))
+    information, residual, inliers, visible = _normal_equations(
+        reference, labels, normals, projected, cosines, sines, pose
+    )
+    share, overlap = inliers / max(1, visible), inliers / max(1, int(np.count_nonzero(current_labels)))
     if not converged or inliers < MIN_OVERLAP * len(angles):
-        return ScanMatch(np.array(initial_guess, float), UNSEEN_M**2 * np.eye(3), share, residual, False)
-    return ScanMatch(pose, _covariance(information, residual), share, residual, True)
+        return ScanMatch(np.array(initial_guess, float), UNSEEN_M**2 * np.eye(3), share, residual, False, overlap)
+    return ScanMatch(pose, _covariance(information, residual), share, residual, True, overlap)
 
 
 @njit(cache=True)
@@ -187,16 +190,20 @@ def _normal_equations(
     cosines: Array,
     sines: Array,
     pose: Array,
-) -> tuple[Array, float, int]:
-    """Σ w J Jᵀ (3, 3) of x, y, θ for residuals of unit variance; their root mean square [m]; how many are inliers.
+) -> tuple[Array, float, int, int]:
+    """Σ w J Jᵀ (3, 3) of x, y, θ for residuals of unit variance; their root mean square [m]; how many beams are inliers
+    and how many should be, as nothing in the reference stands before them.
 
     Noisy normals would see features on a smooth wall: a normal that is off by ε adds ε² T Tᵀ, T along the wall. What is
     to be expected of that, by the residuals' own size, is taken off again.
     """
-    squares, count = 0.0, 0
+    squares, count, visible = 0.0, 0, 0
     for k in range(len(reference)):
         if labels[k] > 0 and projected[k] > 0:
-            distance = (reference[k] - projected[k]) * (normals[k, 0] * cosines[k] + normals[k, 1] * sines[k])
+            difference = reference[k] - projected[k]
+            distance = difference * (normals[k, 0] * cosines[k] + normals[k, 1] * sines[k])
+            if difference > -BEHIND_M or abs(distance) < FINE_M:
+                visible += 1
             if abs(distance) < FINE_M:
                 squares, count = squares + distance * distance, count + 1
     residual = math.sqrt(squares / max(count, 1))
@@ -214,7 +221,7 @@ def _normal_equations(
             for a in range(3):
                 for b in range(3):
                     information[a, b] += weight * (row[a] * row[b] - doubt * false_row[a] * false_row[b])
-    return information, residual, count
+    return information, residual, count, visible
 
 
 def _covariance(information: Array, residual: float) -> Array:

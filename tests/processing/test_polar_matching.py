@@ -183,6 +183,16 @@ def test_projection_hides_what_stands_behind_and_what_shows_its_back() -> None:
     assert_allclose(projected[beside_panel], 5 / np.cos(LMS111[beside_panel]), rtol=1e-9)
 
 
+def test_inliers_are_of_what_both_can_see_and_overlap_is_of_all() -> None:
+    """Round a corner: the current scan sees a room that the reference only sees the door of."""
+    walls = np.vstack([polyline((-6, -1), (1, -1), (1, -6), (9, -6), (9, 1), (-6, 1)), polyline((-6, -1), (-6, 1))])
+    motion = np.array([1.4, -0.3, -0.3])
+    match = match_polar(scan(walls, STILL), scan(walls, motion), LMS111, motion)
+    assert_found(match, motion, 0.01, 0.2)
+    assert match.inliers > 0.9
+    assert match.overlap < 0.8
+
+
 @pytest.mark.parametrize("empty", [np.inf, np.nan, 0.0, -1.0])
 def test_nothing_seen_is_no_match(empty: float) -> None:
     guess = np.array([0.1, 0.0, 0.05])
