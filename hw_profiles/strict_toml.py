@@ -4,6 +4,7 @@ The law: a key that the record does not know is refused by its path, with the ne
 """
 
 import difflib
+import math
 import tomllib
 import types
 import typing
@@ -31,6 +32,8 @@ def parse_toml(text: str, kind: type[RecordT], what: str) -> RecordT:
     for key, known in _unknown_keys(raw, kind, ""):
         near = difflib.get_close_matches(key.rsplit(".", 1)[-1], known, n=1, cutoff=0.0)
         raise BadInputError(f"{what}: unknown key {key}; the nearest known one is {near[0]}")
+    for key in _unreal_numbers(raw, ""):
+        raise BadInputError(f"{what}: {key} is no finite number")
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
@@ -55,3 +58,15 @@ def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str,
             yield from _unknown_keys(value, hints[key], path)
         elif key != tag_field:
             yield path, known
+
+
+def _unreal_numbers(raw: object, where: str) -> Iterator[str]:
+    """The path of each infinity or NaN (TOML has words for them): no bound would stop a NaN."""
+    if isinstance(raw, float) and not math.isfinite(raw):
+        yield where
+    elif isinstance(raw, dict):
+        for key, value in raw.items():
+            yield from _unreal_numbers(value, f"{where}.{key}".lstrip("."))
+    elif isinstance(raw, list):
+        for index, item in enumerate(raw):
+            yield from _unreal_numbers(item, f"{where}[{index}]")
