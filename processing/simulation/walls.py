@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 CORNER_RADIUS_M = 0.4  # of rough rock, so that normals turn gradually
 LONGEST_SEGMENT_M = 2.0  # keeps the cells of the ray caster's grid few for each
 SIZE_M = 1e-6  # points this near are one point
+SPLINTER_M2 = 1.0
 
 
 def free_space(world: World, generator: np.random.Generator) -> shapely.Geometry:
@@ -47,7 +48,8 @@ def free_space(world: World, generator: np.random.Generator) -> shapely.Geometry
         shapely.make_valid(shapely.Polygon(rough(part.exterior), [rough(hole) for hole in part.interiors]))
         for part in shapely.get_parts(space)
     ]
-    return shapely.union_all(rough_parts).buffer(0)  # where a wall crossed itself, the splinters go
+    # where a wall crossed itself, make_valid leaves splinters
+    return shapely.union_all([part for part in shapely.get_parts(rough_parts) if part.area > SPLINTER_M2])
 
 
 def resample_ring(ring: shapely.LinearRing, step_m: float) -> tuple[Array, Array, float]:

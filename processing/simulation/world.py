@@ -156,13 +156,16 @@ def without_noise(world: World) -> World:
 def route(world: World, run: Run) -> list[tuple[Place, tuple[float, float]]]:
     """The waypoints of a run, with the points between two places of one drift filled in from the drift.
 
+    Where several drifts hold both places, the one with the fewest points between them is meant.
+
     Raises:
-        BadInputError: two drifts join the same two places.
+        BadInputError: two drifts have equally few.
     """
     way: list[Place] = [run.waypoints[0]]
     for start, end in pairwise(run.waypoints):
         stretches = [stretch for drift in world.drifts if (stretch := _stretch(drift.points, start, end)) is not None]
-        if len(stretches) > 1:
+        stretches.sort(key=len)
+        if len(stretches) > 1 and len(stretches[0]) == len(stretches[1]):
             what = f"world {world.name}: run {run.name}: more than one drift joins {start} and {end}"
             raise BadInputError(f"{what}; name a place between them on the one that is meant")
         way += [*(stretches[0] if stretches else []), end]
