@@ -4,17 +4,13 @@ recordings ─ read_log ─ open_loop ─ beacons ─┐
                                              graph ─ pieces (edge_map) ─ assembly ─ grids ─ Atlas
 """
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile
@@ -32,10 +28,10 @@ from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, Scan, match_scans
+from processing.workers import Workers
+from rtlog_client.log_file import read_info
 
 Array = NDArray[np.float64]
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 def match_polar_scans(reference: Scan, current: Scan, guess: Array) -> ScanMatch:
@@ -66,16 +62,16 @@ class DrivenRun:
 
 def build(recordings: list[Path], profile: Profile | None, config: Config, jobs: int = 1) -> Atlas:
     """Map recordings. Raises: BadInputError: a recording is unfit, or two of them are the same run."""
+    _refuse_twins(recordings)
     match = MATCHERS[config.matcher]
-    work = Workers(jobs)
-    runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
-    _refuse_twins(runs, recordings)
-    graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
-    inputs = [piece_input(piece, runs) for piece in graph.pieces]
-    solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
-    place = place_by_frames if config.assembly == "refined" else place_by_lengths
-    placed = place(solved, graph, match)
-    grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
+    with Workers(jobs) as work:
+        runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
+        graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
+        inputs = [piece_input(piece, runs) for piece in graph.pieces]
+        solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
+        place = place_by_frames if config.assembly == "refined" else place_by_lengths
+        placed = place(solved, graph, match)
+        grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
     return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed))
 
 
@@ -125,24 +121,11 @@ def remarks(runs: list[DrivenRun], placed: Placement) -> list[str]:
     return out + placed.remarks
 
 
-def _refuse_twins(runs: list[DrivenRun], recordings: list[Path]) -> None:
+def _refuse_twins(recordings: list[Path]) -> None:
+    """Before any work, so that a slip of the hand is told at once."""
     seen: dict[str, Path] = {}
-    for driven, path in zip(runs, recordings, strict=True):
-        twin = seen.setdefault(driven.run.run_id, path)
-        if twin is not path:
-            raise BadInputError(f"{path} and {twin} are the same run {driven.run.run_id}")
-
-
-class Workers:
-    """Work on independent items, here or in `jobs` processes; the results do not depend on where."""
-
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
-
-    def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-        items = list(items)
-        bar = partial(tqdm, total=len(items), desc=label, disable=None, leave=False)
-        if self.jobs == 1 or len(items) < 2:
-            return [function(item) for item in bar(items)]
-        with ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool:
-            return list(bar(pool.map(function, items)))
+    for path in recordings:
+        run_id = read_info(path).run_id
+        if run_id in seen:
+            raise BadInputError(f"{seen[run_id]} and {path} are the same run, {run_id}")
+        seen[run_id] = path
