@@ -113,9 +113,8 @@ def _info(args: argparse.Namespace) -> None:
         print(f"run   {run['id']}: {run['ticks']} ticks, profile {run['profile']}")
     for node in document["nodes"]:
         place = f"({node['x']:.2f}, {node['y']:.2f}) m"
-        print(
-            f"node  {node['id']}: {node['epc']} at {place}, read within {node['range']:.1f} m, {len(node['passes'])} passes"
-        )
+        reach = f"read within {node['range']:.1f} m, {len(node['passes'])} passes"
+        print(f"node  {node['id']}: {node['epc']} at {place}, {reach}")
     for edge in document["edges"]:
         length = "" if edge["length"] is None else f", {edge['length']:.2f} m"
         print(
@@ -155,3 +154,7 @@ def _import(args: argparse.Namespace) -> None:
     print(f"{args.output}: {counts.scans} scans, {counts.odometry} poses of odometry")
     for kind, lines in counts.skipped.items():
         print(f"rtlog-atlas: {lines} lines of {kind} are left out", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
