@@ -1,0 +1,66 @@
+"""A small mine: a loop of 40 × 30 m with four tags, driven by two runs, once around and back the other way."""
+
+from pathlib import Path
+
+import pytest
+
+from processing.simulation.simulate import simulate
+
+SMALL_WORLD = """
+schema = 1
+name = "small"
+seed = 4
+profile = "canmet_trailer"
+walls.roughness_m = 0.2
+
+[places]
+start = [8, 0]
+sw = [0, 0]
+se = [40, 0]
+ne = [40, 30]
+nw = [0, 30]
+bay = [20, 12]
+bay_mouth = [20, 0]
+
+[[drifts]]
+points = ["sw", "start", "bay_mouth", "se", "ne", "nw", "sw"]
+width_m = 4.6
+[[drifts]] # a dead end
+points = ["bay_mouth", "bay"]
+width_m = 4.6
+
+[[tags]]
+epc = "E20034120000000000000401"
+at = [29, 1.8]
+[[tags]]
+epc = "E20034120000000000000402"
+at = [41.8, 16]
+[[tags]]
+epc = "E20034120000000000000403"
+at = [20, 28.2]
+[[tags]]
+epc = "E20034120000000000000404"
+at = [-1.8, 14]
+
+[[runs]] # once around, and on to the second tag
+name = "around"
+waypoints = ["start", "se", "ne", "nw", "sw", "se", [40, 23]]
+speed_m_s = 3.0
+[[runs]] # the other way, past the first tag and back to it
+name = "back"
+waypoints = [[32, 30], "ne", "se", "bay_mouth", "se", [40, 8]]
+speed_m_s = 3.0
+
+[noise]
+wheel_radius_error_percent = { left_wheel = 1.0, right_wheel = 0.8 }
+slip_m_per_sqrt_m = 0.005
+"""
+
+
+@pytest.fixture(scope="session")
+def small_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `rtlog-atlas simulate` writes of the small mine: small-around.mcap, small-back.mcap and the truth."""
+    folder = tmp_path_factory.mktemp("small_world")
+    (folder / "small.toml").write_text(SMALL_WORLD, encoding="utf-8")
+    simulate(folder / "small.toml", folder / "small")
+    return folder / "small"
