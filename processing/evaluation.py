@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from processing.geometry import Array, align, compose, relative, transform, wrap_angle
 
 START_EVERY_M = 1.0  # relative errors start at every metre driven, so that standing still weighs nothing
+ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +121,9 @@ def relative_error(runs: Mapping[str, Matched], distance_m: float) -> RelativeEr
     errors = []
     for matched in runs.values():
         driven = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(matched.truth[:, :2], axis=0), axis=1))])
-        starts = np.unique(np.searchsorted(driven, np.arange(0, driven[-1] - distance_m, START_EVERY_M)))
-        ends = np.searchsorted(driven, driven[starts] + distance_m)
+        marks = np.arange(0, driven[-1] - distance_m + ROUNDING_M, START_EVERY_M)
+        starts = np.unique(np.searchsorted(driven, marks - ROUNDING_M))
+        ends = np.searchsorted(driven, driven[starts] + distance_m - ROUNDING_M)
         starts, ends = starts[ends < len(driven)], ends[ends < len(driven)]
         true_motion = relative(matched.truth[starts], matched.truth[ends])
         errors.append(relative(true_motion, relative(matched.estimate[starts], matched.estimate[ends])))

@@ -122,10 +122,11 @@ def draw_map(image: MapImage, overlay: Overlay) -> Image.Image:
         draw.line(place(trajectory), fill=(150, 190, 240), width=1)
     for edge in overlay.edges:
         draw.line(place(edge), fill=BLUE, width=2)
-    font = ImageFont.load_default(size=14)
+    size = max(14, max(picture.size) // 100)
+    font, r = ImageFont.load_default(size=size), size // 3
     for (x, y), name in zip(place(overlay.nodes), overlay.names, strict=True):
-        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=RED, outline=OPEN)
-        draw.text((x + 8, y - 8), name, fill=RED, font=font, stroke_width=2, stroke_fill=OPEN)
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=RED, outline=OPEN)
+        draw.text((x + 2 * r, y - 2 * r), name, fill=RED, font=font, stroke_width=2, stroke_fill=OPEN)
     _draw_scale_bar(draw, picture, pixels_per_m, font)
     return picture
 
@@ -153,4 +154,4 @@ def _draw_scale_bar(
     x, y = 15.0, picture.height - 15.0
     end = x + length_m * pixels_per_m
     draw.line([(x, y - 5), (x, y), (end, y), (end, y - 5)], fill=INK, width=2)
-    draw.text((x + 5, y - 22), f"{length_m:g} m", fill=INK, font=font, stroke_width=2, stroke_fill=OPEN)
+    draw.text((x + 5, y - 6), f"{length_m:g} m", fill=INK, font=font, anchor="lb", stroke_width=2, stroke_fill=OPEN)

@@ -25,7 +25,7 @@ MOVE = np.array([12.0, -7.0, 2.5])
 def drive(turn_per_step: float = 0.0) -> np.ndarray:
     """A winding drive of 300 steps of 1 m."""
     motions = np.column_stack([np.ones(300), np.zeros(300), 0.05 * np.sin(np.arange(300) / 9)])
-    return accumulate(np.zeros(3), motions + [0, 0, turn_per_step])
+    return accumulate(np.zeros(3), motions + np.array([0, 0, turn_per_step]))
 
 
 def figures(runs: dict[str, Matched], parts: dict[str, int]):
@@ -65,7 +65,7 @@ def test_known_drift_of_motion() -> None:
     stretched = relative_error({"a": Matched(straight * [1.01, 1, 1], straight, 0)}, 10)
     turned = relative_error({"a": Matched(drive(turn_per_step=0.001), drive(), 0)}, 10)
     assert_allclose(stretched.translation_rmse_m, 0.1, rtol=1e-6)
-    assert (stretched.distance_m, stretched.pairs) == (10, 290)
+    assert (stretched.distance_m, stretched.pairs) == (10, 291)
     assert_allclose(turned.rotation_rmse_deg, np.degrees(0.01), rtol=1e-6)
     assert relative_error({"a": Matched(straight[:50], straight[:50], 0)}, 100) is None
 
