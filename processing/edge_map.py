@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from processing.geometry import accumulate, relative
 from processing.pose_graph import Links, Solution, solve
+from processing.relocation import NO_LINKS, relocate_stretch
 from processing.scan_matching import Matcher, Scan
 from processing.strong_links import (
     HOP_INLIERS,
     LOOP_INLIERS,
     LOOP_RADIUS_M,
-    SEARCH_INLIERS,
     KeyFrames,
     hop_pairs,
     loop_pairs,
@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STRETCH_M = 15.0
-SEARCHES = 8  # of a stretch that is astray
+FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this share match, are no closed loop
+LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
 MAX_ROUNDS = 5
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
@@ -83,6 +84,15 @@ class Drift:
             self.way_m + float(steps.sum()),
         )
 
+    def at_most(self, radius_m: float, radius_rad: float) -> "Drift":
+        """This drift, or a smaller one that is known from elsewhere."""
+        return self if self.radius_m <= radius_m else Drift((radius_m / 3) ** 2, (radius_rad / 3) ** 2)
+
+    @property
+    def is_astray(self) -> bool:
+        """Too far for a match from here?"""
+        return self.radius_m > 1.0 or self.radius_rad > 0.2
+
     @property
     def radius_m(self) -> float:
         return min(3 * float(np.hypot(self.variance_m2**0.5, self.sway_m)) + 0.02 * self.way_m, MAX_DRIFT_M)
@@ -102,9 +112,9 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         + _joins(paths, firsts)
         + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
     )
-    loops = links[np.zeros(0, np.int64)]
-    count = len(poses)
-    present = np.zeros(count, bool)
+    loops = NO_LINKS
+    present = np.zeros(len(poses), bool)
+    strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
         drift = Drift()
         for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
@@ -112,25 +122,49 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
                 poses[stretch] = accumulate(poses[stretch[0] - 1], onward.motions)[1:]
                 drift = drift.after(onward)
-            pairs = loop_pairs(frames, poses, stretch, np.flatnonzero(present), LOOP_RADIUS_M + drift.radius_m)
-            astray = drift.radius_m > 1.0 or drift.radius_rad > 0.2
-            found = match_pairs(frames, poses, pairs, SEARCH_INLIERS if astray else LOOP_INLIERS)
-            if astray and len(found) < 0.3 * len(pairs):
-                found = match_pairs(
-                    frames,
-                    poses,
-                    pairs[:: max(1, len(pairs) // SEARCHES)],
-                    SEARCH_INLIERS,
-                    drift.radius_m,
-                    drift.radius_rad,
-                )
+            old = np.flatnonzero(present)
             present[stretch] = True
-            if len(found) or stretch[0] == firsts[path]:
-                loops = loops + found
+            found, poses, lost = _close(frames, poses, links + loops, stretch, old, present, strayed, drift)
+            if lost:
+                drift = Drift((LOST_M / 3) ** 2, (LOST_RAD / 3) ** 2)
+            loops = loops + found
+            if len(found):
                 poses = _solve_present(poses, links + loops, present)
-            if len(found) > 2:
-                drift = Drift()
+                anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
+                drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
+            strayed[stretch] = drift.radius_m, drift.radius_rad
     return _settle(frames, links, poses, firsts)
+
+
+def _close(
+    frames: KeyFrames,
+    poses: Array,
+    links: Links,
+    stretch: Ints,
+    old: Ints,
+    present: NDArray[np.bool_],
+    strayed: Array,
+    drift: Drift,
+) -> tuple[Links, Array, bool]:
+    """The loops that a new stretch closes, the poses with the stretch where it was found, and whether it is lost.
+
+    Where most pairs that should match do not, the stretch lies elsewhere, and the few that do are chance.
+    """
+    for radius_m, radius_rad in ((drift.radius_m, drift.radius_rad), (LOST_M, LOST_RAD)):
+        lost = radius_m > drift.radius_m
+        found, tried = NO_LINKS, poses
+        if drift.is_astray or lost:
+            surer = old[strayed[old, 0] < 0.5 * radius_m]
+            found = relocate_stretch(frames, poses, stretch, surer, radius_m, radius_rad)
+            if lost and not len(found):
+                break
+            if len(found):
+                tried = _solve_present(poses, links + found, present)
+        pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
+        closed = match_pairs(frames, tried, pairs, LOOP_INLIERS)
+        if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
+            return found + closed, tried, False
+    return NO_LINKS, poses, True
 
 
 def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> PieceMap:

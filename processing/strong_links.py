@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from processing.geometry import compose, inverse, relative
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import Matcher, Scan, search_match
+from processing.scan_matching import Matcher, Scan
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,7 +28,6 @@ HOP_INLIERS = 0.6
 LOOP_RADIUS_M = 2.5  # Δr_max
 LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
 LOOP_INLIERS = 0.6
-SEARCH_INLIERS = 0.75  # a match that had to be searched for must be a better one
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
 
 
@@ -85,15 +84,9 @@ def match_vehicles(
     guess: Array,
     mount: Array,
     match: Matcher,
-    radius_m: float = 0.0,
-    radius_rad: float = 0.0,
 ) -> ScanMatch:
-    """Match two scans; guess and result are motions of the vehicle. With a radius, search around the guess."""
-    scanner_guess = compose(inverse(mount), compose(guess, mount))
-    if radius_m > 0:
-        found = search_match(reference, current, scanner_guess, radius_m, radius_rad)
-    else:
-        found = match(reference, current, scanner_guess)
+    """Match two scans; guess and result are motions of the vehicle."""
+    found = match(reference, current, compose(inverse(mount), compose(guess, mount)))
     motion, covariance = through_mount(mount, found.motion, found.covariance)
     return replace(found, motion=motion, covariance=covariance)
 
@@ -104,15 +97,13 @@ def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
     return bool(found.converged and found.inliers >= min_inliers and seen)
 
 
-def match_pairs(
-    frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float, radius_m: float = 0.0, radius_rad: float = 0.0
-) -> Links:
+def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float) -> Links:
     """The links that come of the pairs (p, 2): those whose scans match well and say something."""
     ends, motions, informations = [], [], []
     for i, j in pairs:
         guess = relative(poses[i], poses[j])
         reference, current = frames.scans[i], frames.scans[j]
-        found = match_vehicles(reference, current, guess, frames.mount, frames.match, radius_m, radius_rad)
+        found = match_vehicles(reference, current, guess, frames.mount, frames.match)
         if not worth_a_link(found, min_inliers):
             continue
         ends.append((i, j))

@@ -23,7 +23,7 @@ from rtlog_server import messages, topics
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
-LATENESS_S = (20e-6, 200e-6)  # of a tick, on an idle board
+LATENESS_NS = (20_000, 200_000)  # of a tick, on an idle board
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,29 +84,23 @@ def write_recording(
     }
     tick_ns, sweep_ns = stamps_of(start_ns, samples.tick_s), stamps_of(start_ns, samples.sweep_s)
     latched_ns, round_ns = stamps_of(start_ns, samples.latched_s), stamps_of(start_ns, samples.round_s)
-    lateness_s = np.random.default_rng(boot_id.int).uniform(*LATENESS_S, len(tick_ns))
+    lateness_ns = np.random.default_rng(boot_id.int).integers(*LATENESS_NS, len(tick_ns))
     newest_sweep_ns = np.maximum.accumulate(np.where(samples.has_scan, sweep_ns, sweep_ns[0]))
     reads = {tick: list(found) for tick, found in groupby(samples.readings, key=lambda reading: reading.tick)}
     names = [encoder.name for encoder in profile.encoders]
+    scan_number = np.cumsum(samples.has_scan) - 1  # the server numbers what it sent, recorded or not
     with LogWriter(path, metadata, profile_toml) as log:
         for k in np.flatnonzero(samples.is_recorded).tolist():
-            now_ns = int(tick_ns[k])
-
-            def put(topic: topics.Topic, message: object, stamp_ns: int, now_ns: int = now_ns) -> None:
-                log.write(topic.name, topic.msgtype, messages.encode(message), now_ns, stamp_ns)
-
-            newest = {
-                "laser/primary": int(newest_sweep_ns[k]),
-                "encoders": int(latched_ns[k]),
-                "rfid": int(round_ns[k]),
-            }
-            begun_ns = now_ns + round(lateness_s[k] * 1e9)
-            put(topics.TICK, tick_message(k, now_ns, begun_ns, newest), begun_ns)
+            now_ns, begun_ns = int(tick_ns[k]), int(tick_ns[k] + lateness_ns[k])
+            sweep, latched = int(sweep_ns[k]), int(latched_ns[k])
+            newest = {"laser/primary": int(newest_sweep_ns[k]), "encoders": latched, "rfid": int(round_ns[k])}
+            sent = [(topics.TICK, tick_message(k, now_ns, begun_ns, newest), begun_ns, k)]
             if samples.has_scan[k]:
-                put(topics.PRIMARY_SCAN, scan_message(int(sweep_ns[k]), samples.ranges[k]), int(sweep_ns[k]))
-            joints = joint_message(int(latched_ns[k]), names, samples.positions[k])
-            put(topics.JOINT_STATES, joints, int(latched_ns[k]))
-            put(topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns)
+                sent.append((topics.PRIMARY_SCAN, scan_message(sweep, samples.ranges[k]), sweep, int(scan_number[k])))
+            sent.append((topics.JOINT_STATES, joint_message(latched, names, samples.positions[k]), latched, k))
+            sent.append((topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns, k))
+            for topic, message, stamp_ns, sequence in sent:
+                log.write(topic.name, topic.msgtype, messages.encode(message), now_ns, stamp_ns, sequence)
 
 
 def tick_message(index: int, scheduled_ns: int, begun_ns: int, newest_ns: dict[str, int]) -> object:

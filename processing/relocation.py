@@ -1,0 +1,130 @@
+"""Relocation: where a key frame lies on the map so far, when open loop has strayed too far for a match from there.
+
+In: a scan, a guess and how wrong it may be; key frames with known poses. Out: the best pose. Every pose of a window around
+the guess is tried on a likelihood field (Olson 2009, correlative scan matching, in its plain form): an image of the known
+walls, blurred by as much as one step of the search, in which the moved points of the scan are looked up and added.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from processing.geometry import compose, inverse, relative, transform, wrap_angle
+from processing.pose_graph import Links
+from processing.scan_matching import Scan, score
+from processing.strong_links import KeyFrames, match_vehicles
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CELL_M = 0.15
+MAX_POINTS = 180  # of a scan, evenly chosen: more only make it slower
+MAX_RANGE_M = 15.0
+TRIES = 6  # key frames of a stretch
+MIN_SHARE = 0.5  # of a scan's points on walls
+MIN_SCORE = 0.3
+AGREE_M, AGREE_RAD = 1.0, 0.15
+NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)
+
+
+def likelihood_field(scans: list[Scan], laser_poses: Array) -> tuple[NDArray[np.uint8], Array]:
+    """The walls (H, W) seen by key frames: 4 on a wall, less beside it; and the corner (2,) of cell [0, 0]."""
+    points = np.concatenate(
+        [transform(pose, _points(scan)) for scan, pose in zip(scans, laser_poses, strict=True)] or [np.zeros((1, 2))]
+    )
+    origin = points.min(axis=0) - 2 * CELL_M
+    size = np.ceil((points.max(axis=0) - origin) / CELL_M).astype(int) + 2
+    field = np.zeros((size[1], size[0]), np.uint8)
+    column, row = ((points - origin) / CELL_M).astype(int).T
+    for dy, dx, value in [(0, 0, 4)] + [(y, x, 2) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]:
+        np.maximum.at(field, (row + dy, column + dx), np.uint8(value))
+    return field, origin
+
+
+def _points(scan: Scan) -> Array:
+    points = scan.points[np.isfinite(scan.points[:, 0])]
+    points = points[np.hypot(*points.T) < MAX_RANGE_M]
+    return points[:: max(1, len(points) // MAX_POINTS)]
+
+
+def relocate(
+    scan: Scan, field: NDArray[np.uint8], origin: Array, guess: Array, mount: Array, radius_m: float, radius_rad: float
+) -> tuple[Array, float]:
+    """The best pose (3,) of the vehicle around `guess`, and the share of the scan's points that lie on walls there."""
+    points = _points(scan)
+    reach = float(np.hypot(*points.T).max(initial=1.0))
+    turns = np.arange(-radius_rad, radius_rad + 1e-9, CELL_M / reach)
+    laser = compose(guess, mount)
+    best, value = _search(field, (laser[:2] - origin) / CELL_M, laser[2] + turns, points / CELL_M, radius_m / CELL_M)
+    turned = laser + np.array([best[0] * CELL_M, best[1] * CELL_M, turns[int(best[2])]])
+    found = compose(turned, inverse(mount))
+    return found, value / (4.0 * max(len(points), 1))
+
+
+def relocate_stretch(
+    frames: KeyFrames, poses: Array, stretch: Ints, known: Ints, radius_m: float, radius_rad: float
+) -> Links:
+    """Links from known key frames to some of a stretch that may lie up to `radius_m` and `radius_rad` off; or none.
+
+    A place is believed when two key frames of the stretch are found apart from each other, and agree on how far the
+    stretch is off.
+    """
+    middle = poses[stretch, :2].mean(axis=0)
+    known = known[np.hypot(*(poses[known, :2] - middle).T) < radius_m + MAX_RANGE_M]
+    if len(known) < 2 or len(stretch) < 2:
+        return NO_LINKS
+    field, origin = likelihood_field([frames.scans[k] for k in known], compose(poses[known], frames.mount))
+    ends, motions, informations, shifts = [], [], [], []
+    for k in stretch[np.unique(np.linspace(0, len(stretch) - 1, TRIES).astype(int))]:
+        place, share = relocate(frames.scans[k], field, origin, poses[k], frames.mount, radius_m, radius_rad)
+        if share < MIN_SHARE:
+            continue
+        near = known[np.argmin(np.hypot(*(poses[known, :2] - place[:2]).T))]
+        guess = relative(poses[near], place)
+        found = match_vehicles(frames.scans[near], frames.scans[k], guess, frames.mount, frames.match)
+        if score(found) < MIN_SCORE:
+            continue
+        ends.append((int(near), int(k)))
+        motions.append(found.motion)
+        informations.append(np.linalg.inv(found.covariance))
+        shifts.append(compose(compose(poses[near], found.motion), inverse(poses[k])))
+    if not shifts:
+        return NO_LINKS
+    moved = np.array([[*transform(shift, middle), shift[2]] for shift in shifts])
+    apart = np.abs(moved[:, None] - moved[None])
+    apart[..., 2] = np.abs(wrap_angle(apart[..., 2]))
+    agree = (np.hypot(apart[..., 0], apart[..., 1]) < AGREE_M) & (apart[..., 2] < AGREE_RAD)
+    best = int(np.argmax(agree.sum(axis=1)))
+    if agree[best].sum() < 2:
+        return NO_LINKS
+    return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)[np.flatnonzero(agree[best])]
+
+
+@njit(cache=True)
+def _search(
+    field: NDArray[np.uint8], start: Array, headings: Array, points: Array, radius: float
+) -> tuple[tuple[float, float, float], float]:
+    """The shift [cells] and the number of the heading with the largest sum of the field under the points."""
+    height, width = field.shape
+    cells = int(math.ceil(radius))
+    side = 2 * cells + 1
+    best, best_sum = (0.0, 0.0, 0.0), -1.0
+    sums = np.zeros((side, side), np.int32)
+    for k in range(len(headings)):
+        c, s = math.cos(headings[k]), math.sin(headings[k])
+        sums[:] = 0
+        for i in range(len(points)):
+            column = int(math.floor(start[0] + c * points[i, 0] - s * points[i, 1])) - cells
+            row = int(math.floor(start[1] + s * points[i, 0] + c * points[i, 1])) - cells
+            low, high = max(0, -column), min(side, width - column)
+            for dy in range(max(0, -row), min(side, height - row)):
+                for dx in range(low, high):
+                    sums[dy, dx] += field[row + dy, column + dx]
+        for dy in range(side):
+            for dx in range(side):
+                if sums[dy, dx] > best_sum:
+                    best_sum = float(sums[dy, dx])
+                    best = (float(dx - cells), float(dy - cells), float(k))
+    return best, best_sum
