@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hw_profiles.errors import BadInputError
+from hw_profiles.errors import BadInputError, RTLogError
 from processing.map_files import Overlay, write_map
 from processing.occupancy_grid import Grid, stitch
 from processing.tum import write_tum
@@ -38,31 +38,48 @@ class Atlas:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raises: BadInputError: the atlas exists already, or its folder does not."""
-    if path.exists():
-        raise BadInputError(f"{path} exists already; it is left as it is")
-    if not path.parent.is_dir():
-        raise BadInputError(f"{path.parent}: no such folder")
+    """Raises: BadInputError: the atlas exists already, or its folder does not, or may not be written to."""
+    try:
+        if path.exists() or path.is_symlink():
+            raise BadInputError(f"{path} exists already; it is left as it is")
+        if not path.parent.is_dir():
+            raise BadInputError(f"{path.parent}: no such folder")
+    except OSError as error:  # a name that is too long, a folder above that is closed
+        raise BadInputError(f"{path}: {error.strerror or error}") from error
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise BadInputError(f"{path.parent}: no permission to write here")
 
 
 def write_atlas(path: Path, atlas: Atlas) -> None:
-    """Write the folder beside its place, and move it there once it is whole. Raises: BadInputError: it exists."""
+    """Write the folder beside its place, and move it there once it is whole.
+
+    Raises:
+        BadInputError: there is something at `path` already.
+        RTLogError: the disk is full, or will not have it for another reason.
+    """
     refuse_existing(path)
-    part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        part.chmod(0o755)
-        (part / "edges").mkdir()
-        (part / "trajectories").mkdir()
-        for name, arrays in atlas.edges.items():
-            np.savez_compressed(part / "edges" / f"{name}.npz", allow_pickle=False, **arrays)
-        for run_id, (stamps_ns, poses) in atlas.trajectories.items():
-            write_tum(part / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
-        write_map(part, stitch(atlas.grids, atlas.frames), _overlay(atlas))
-        text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
-        (part / "atlas.json").write_text(text + "\n", encoding="utf-8")
-        os.rename(part, path)  # noqa: PTH104 - Path.rename is the same, but says less clearly that it is atomic
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            part.chmod(0o755)
+            _write_files(part, atlas)
+            part.rename(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)  # after the renaming, nothing is there
+    except OSError as error:
+        raise RTLogError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _write_files(folder: Path, atlas: Atlas) -> None:
+    (folder / "edges").mkdir()
+    (folder / "trajectories").mkdir()
+    for name, arrays in atlas.edges.items():
+        np.savez_compressed(folder / "edges" / f"{name}.npz", allow_pickle=False, **arrays)
+    for run_id, (stamps_ns, poses) in atlas.trajectories.items():
+        write_tum(folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
+    write_map(folder, stitch(atlas.grids, atlas.frames), _overlay(atlas))
+    text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
+    (folder / "atlas.json").write_text(text + "\n", encoding="utf-8")
 
 
 def read_document(path: Path) -> dict[str, Any]:

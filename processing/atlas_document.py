@@ -101,8 +101,13 @@ def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[
 
 
 def strong_links(piece: Placed) -> NDArray[np.bool_]:
-    """Which links join poses that are not neighbours on a path."""
-    return np.asarray(np.diff(piece.solved.map.links.ends, axis=1)[:, 0] != 1)
+    """Which links are scan matches of poses that are not neighbours on a path. The others are the chain of the drive,
+    its odometry, and what a tag alone joins.
+    """
+    links = piece.solved.map.links
+    path = np.searchsorted(piece.solved.map.firsts, links.ends, side="right")
+    neighbours = (path[:, 0] == path[:, 1]) & (np.abs(links.ends[:, 1] - links.ends[:, 0]) == 1)
+    return np.asarray(links.robust & ~neighbours)
 
 
 def _arrays(piece: Placed, runs: list["DrivenRun"], grid: Grid) -> dict[str, NDArray[Any]]:

@@ -7,11 +7,11 @@ pass of the same tag is another cloud. The tag itself is never located: it only 
     tag read         x  x     x  x     x           its centre is 44, the median of the index range 41 … 47
                      |<--- 2 range --->|
 
-In: reads of (pose index, EPC), open-loop poses. Out: passes in driving order.
+In: reads of (pose index, EPC), open-loop poses. Out: passes in driving order, each with a centre of its own.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,20 +43,34 @@ def find_passes(
 ) -> list[Pass]:
     """Cut each tag's reads into clouds wherever it was silent for too long, and reduce each to its centre and range."""
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    passes = []
+    clouds = []
     for epc in np.unique(epcs).tolist():
         reads = np.sort(indices[epcs == epc])
         silent = (np.diff(reads) > max_gap_poses) & (np.diff(travelled[reads]) > max_gap_m)
         for cloud in np.split(reads, np.flatnonzero(silent) + 1):
             first, last = int(cloud[0]), int(cloud[-1])
-            centre = (first + last) // 2
-            chord = np.hypot(*(poses[last, :2] - poses[first, :2]))
-            x, y = poses[centre, :2].tolist()
-            passes.append(Pass(epc, centre, first, last, x, y, float(chord / 2)))
-    return sorted(passes, key=lambda found: (found.centre, found.epc))
+            clouds.append(((first + last) // 2, epc, first, last))
+    clouds.sort()
+    centres = _apart(np.array([centre for centre, *_ in clouds], np.int64), len(poses))
+    passes = []
+    for centre, (_, epc, first, last) in zip(centres.tolist(), clouds, strict=True):
+        chord = np.hypot(*(poses[last, :2] - poses[first, :2]))
+        x, y = poses[centre, :2].tolist()
+        passes.append(Pass(epc, centre, first, last, x, y, float(chord / 2)))
+    return passes
+
+
+def _apart(centres: Ints, count: int) -> Ints:
+    """Ascending centres, each moved by no more of the `count` poses than keeps it off its neighbours.
+
+    Two tags on one bolt are two passes, and a drive cannot be cut twice at one pose.
+    """
+    rank = np.arange(len(centres))
+    moved = np.maximum.accumulate(centres - rank) + rank
+    return np.minimum(moved, count - len(centres) + rank)
 
 
 def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:
-    """Neighbouring passes of two different tags whose clouds overlap: both are kept, the operator should know."""
-    pairs = pairwise(passes)
-    return [(a, b) for a, b in pairs if a.epc != b.epc and b.first <= a.last]
+    """Passes of two different tags whose clouds overlap: both are kept, the operator should know."""
+    pairs = combinations(passes, 2)
+    return [(a, b) for a, b in pairs if a.epc != b.epc and b.first <= a.last and a.first <= b.last]

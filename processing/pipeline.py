@@ -33,6 +33,8 @@ from rtlog_client.log_file import read_info
 
 Array = NDArray[np.float64]
 
+MIN_SCANS = 10  # a second
+
 
 def match_polar_scans(reference: Scan, current: Scan, guess: Array) -> ScanMatch:
     """Polar scan matching on scans as the other stages keep them."""
@@ -78,6 +80,8 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, jobs:
 def drive_through(recording: Path, profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
     """Read one recording, find its passes and estimate it open loop."""
     run = read_log(recording, profile)
+    if len(run.scans.times) < MIN_SCANS:
+        raise BadInputError(f"{recording}: {len(run.scans.times)} scans are too few to map")
     driven = dead_reckon(odometry_at_scans(run))
     passes: list[Pass] = []
     if config.method == "landmark" and len(run.tags.epcs):

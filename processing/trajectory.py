@@ -37,13 +37,14 @@ def run_trajectory(run: Run, loop: OpenLoop, keyframes: Array) -> tuple[NDArray[
     at_scans = loop.place(keyframes)
     driven = drive_blind(run)
     blind = interpolate_poses(run.motion_times, driven, run.scans.times)
-    k = np.clip(np.searchsorted(run.scans.times, run.motion_times, side="right") - 1, 0, len(blind) - 2)
-    share = (run.motion_times - run.scans.times[k]) / (run.scans.times[k + 1] - run.scans.times[k])
+    arrives = compose(at_scans[:-1], relative(blind[:-1], blind[1:]))
+    missed = np.vstack([relative(arrives, at_scans[1:]), np.zeros(3)])  # after the last scan there is nothing to meet
+    lasts = np.append(np.diff(run.scans.times), np.inf)
+    k = np.maximum(np.searchsorted(run.scans.times, run.motion_times, side="right") - 1, 0)
+    share = np.maximum(run.motion_times - run.scans.times[k], 0.0) / lasts[k]
     after = compose(at_scans[k], relative(blind[k], driven))
-    arrives = compose(at_scans[k], relative(blind[k], blind[k + 1]))
-    missed = relative(arrives, at_scans[k + 1]) * np.clip(share, 0.0, 1.0)[:, None]
+    poses = np.concatenate([at_scans, compose(after, missed[k] * share[:, None])])
     stamps = np.concatenate([run.scans.stamps_ns, run.motion_ns])
-    poses = np.concatenate([at_scans, compose(after, missed)])
     stamps, first = np.unique(stamps, return_index=True)
     return stamps, poses[first]
 

@@ -1,5 +1,6 @@
 """Trajectories as text, in the format of the TUM benchmarks: `t x y z qx qy qz qw` a line, t in seconds UTC."""
 
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +23,27 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Array]:
     """Stamps [ns] and poses (n, 3). Raises: BadInputError: the file cannot be read, or a line is malformed: with its
     number.
     """
-    stamps: list[int] = []
-    rows: list[tuple[float, ...]] = []
+    stamps: list[np.int64] = []
+    rows: list[list[float]] = []
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path}: {error}") from error
+    except OSError as error:
+        raise BadInputError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{path}: not UTF-8 text (byte {error.start})") from error
     for number, line in enumerate(lines, start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
+        if len(words) != 8:
+            raise BadInputError(f"{path}: line {number}: {len(words)} numbers instead of 8")
         try:
-            if len(words) != 8:
-                raise ValueError(f"{len(words)} numbers instead of 8")
-            whole, _, fraction = words[0].partition(".")
-            stamps.append(int(whole) * 10**9 + int(fraction.ljust(9, "0")[:9] or 0))
-            rows.append(tuple(float(word) for word in words[1:]))
-        except ValueError as error:
-            raise BadInputError(f"{path}: line {number}: {error}") from error
+            stamps.append(np.int64(int(Decimal(words[0]).scaleb(9))))  # exact, also as 1.4036e+09
+            rows.append([float(word) for word in words[1:]])
+        except (ValueError, ArithmeticError) as error:
+            raise BadInputError(f"{path}: line {number}: not a number among {line.strip()!r}") from error
+        if not np.all(np.isfinite(rows[-1])):
+            raise BadInputError(f"{path}: line {number}: a pose that is not finite")
     values = np.array(rows).reshape(-1, 7)
     x, y, _, qx, qy, qz, qw = values.T
     heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
