@@ -4,7 +4,7 @@ PY := .venv/bin/python
 .PHONY: demo test lint bench hil docs lock
 
 demo: .venv/ready
-	$(PY) -m processing.demo
+	$(PY) tests/system/demo.py
 
 test: .venv/ready
 	$(PY) -m pytest

@@ -30,7 +30,7 @@ from processing.strong_links import (
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STRETCH_M = 15.0
+STRETCH_M = 5.0
 FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this share match, are no closed loop
 LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
 MAX_ROUNDS = 5
