@@ -72,5 +72,4 @@ def _apart(centres: Ints, count: int) -> Ints:
 
 def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:
     """Passes of two different tags whose clouds overlap: both are kept, the operator should know."""
-    pairs = combinations(passes, 2)
-    return [(a, b) for a, b in pairs if a.epc != b.epc and b.first <= a.last and a.first <= b.last]
+    return [(a, b) for a, b in combinations(passes, 2) if b.first <= a.last and a.first <= b.last]

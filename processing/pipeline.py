@@ -117,8 +117,8 @@ def remarks(runs: list[DrivenRun], placed: Placement) -> list[str]:
         tags = len({found.epc for found in driven.passes})
         if tags < 2:
             out.append(f"run {driven.run.run_id} passed {tags} tag{'s' * (tags != 1)}: it is mapped alone")
-        for a, b in overlapping_passes(driven.passes):
-            out.append(f"run {driven.run.run_id}: the read clouds of {a.epc} and {b.epc} overlap")
+        for a, b in sorted({tuple(sorted((a.epc, b.epc))) for a, b in overlapping_passes(driven.passes)}):
+            out.append(f"run {driven.run.run_id}: the read clouds of {a} and {b} overlap")
         lost = int((~driven.loop.matched[1:]).sum())
         if lost:
             out.append(f"run {driven.run.run_id}: {lost} of {len(driven.loop.matched)} scans follow odometry alone")
