@@ -96,7 +96,8 @@ def undistort(scans: Scans, odometry: Motions, mount: Array) -> NDArray[np.float
     angles = scans.angles
     points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
     if scans.time_increment_s != 0 and len(ranges) > 1:
-        seconds = np.maximum(np.diff(scans.times), 1e-3)
+        seconds = np.diff(scans.times)
+        seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
         rates = np.vstack([odometry.deltas, odometry.deltas[-1:]]) / np.append(seconds, seconds[-1])[:, None]
         since = scans.time_increment_s * np.arange(len(angles))
         if scans.time_increment_s < 0:

@@ -8,6 +8,7 @@ order that is true.
 """
 
 import hashlib
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile, parse_profile
 from rtlog_client.log_file import LogInfo, read_info, read_messages
 from rtlog_server.messages import decode, to_ns
-from rtlog_server.topics import JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
+from rtlog_server.topics import BY_NAME, JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -76,7 +77,8 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     """Read a recording; `profile` stands in for a missing attachment.
 
     Raises:
-        BadInputError: no recording, no laser in it, no odometry in it, or no profile for its encoders.
+        BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders, or messages that
+            are not what their topics say.
     """
     info = read_info(path)
     profile = _profile(path, info, profile)
@@ -86,6 +88,11 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     encoder_topic = next((t for t in (JOINT_STATES.name, ODOMETRY.name) if info.message_counts.get(t)), None)
     if encoder_topic is None:
         raise BadInputError(f"{path}: neither {JOINT_STATES.name} nor {ODOMETRY.name}; the motion is unknown")
+    for topic, wanted in ((scan_topic, PRIMARY_SCAN), (encoder_topic, BY_NAME[encoder_topic]), (TAGS.name, TAGS)):
+        if (found := info.msgtypes.get(topic, wanted.msgtype)) != wanted.msgtype:
+            raise BadInputError(f"{path}: {topic} holds {found}, not {wanted.msgtype}")
+    if info.message_counts[scan_topic] < 2:
+        raise BadInputError(f"{path}: {scan_topic} holds 1 scan; a drive needs more")
     if encoder_topic == JOINT_STATES.name and not profile.encoders:
         raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
     scans: list[Any] = []
@@ -102,7 +109,7 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
             scan_log_times.append(log_time_ns)
         elif topic == encoder_topic:
             value = wheels(message)
-            if value is not None:
+            if value is not None and np.all(np.isfinite(value)):
                 motions.append((to_ns(message.header.stamp), value))
         else:
             reads.extend((to_ns(read.stamp), str(read.epc).upper()) for read in message.reads)
@@ -113,9 +120,12 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     motion_ns = np.array([ns for ns, _ in motions], np.int64)
     motion = np.array([value for _, value in motions], np.float64)
     scan_ns = np.array([to_ns(scan.header.stamp) for scan in scans], np.int64)
-    epoch_ns = int(min(motion_ns.min(), scan_ns.min()))
-    motion_times = rising_times(motion_ns, epoch_ns)
-    scan_times = rising_times(scan_ns, epoch_ns)
+    rising_motion_ns, rising_scan_ns = rising_stamps(motion_ns), rising_stamps(scan_ns)
+    if rising_motion_ns[0] > rising_scan_ns[-1] or rising_scan_ns[0] > rising_motion_ns[-1]:
+        raise BadInputError(f"{path}: by their stamps, {scan_topic} and {encoder_topic} have no time in common")
+    epoch_ns = int(min(rising_motion_ns[0], rising_scan_ns[0]))
+    motion_times = np.asarray((rising_motion_ns - epoch_ns) * 1e-9, np.float64)
+    scan_times = np.asarray((rising_scan_ns - epoch_ns) * 1e-9, np.float64)
     _take_over_times(scan_ns, scan_times, motion_ns, motion_times)
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -143,12 +153,39 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     )
 
 
-def rising_times(stamps_ns: Stamps, epoch_ns: int) -> Array:
-    """Seconds since the epoch, strictly rising: a stamp that runs backwards comes a microsecond after the one before
-    it.
+def rising_stamps(stamps_ns: Stamps) -> Stamps:
+    """Stamps (n,) that rise strictly, in the order of the recording.
+
+    The longest rising run among the stamps is taken at its word; the others are spread evenly over the gaps in it that
+    they were recorded in, or go on at the usual pace before its first and after its last.
     """
-    steps = np.arange(len(stamps_ns)) * 1_000
-    return np.asarray(np.maximum.accumulate(stamps_ns - epoch_ns - steps) + steps, np.float64) * 1e-9
+    believed, index = _longest_rising(stamps_ns), np.arange(len(stamps_ns))
+    first, last = believed[0], believed[-1]
+    since = stamps_ns[believed] - stamps_ns[first]
+    spread = np.interp(index, believed, since)
+    pace = np.median(np.diff(since) / np.diff(believed)) if len(believed) > 1 else 0.0
+    spread += pace * (np.minimum(index - first, 0) + np.maximum(index - last, 0))
+    rising = np.maximum.accumulate(np.round(spread).astype(np.int64) - index) + index
+    return np.asarray(stamps_ns[first] + rising, np.int64)
+
+
+def _longest_rising(stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Indices of the longest strictly rising run, which may leave stamps out (Schensted 1961).
+
+    Taken from the last stamp to the first, so that of two that contradict each other the earlier is believed.
+    """
+    firsts: list[int] = []  # negated: the highest stamp that a run of each length can begin with
+    starts: list[int] = []  # and its index
+    after = [-1] * len(stamps_ns)
+    for k in range(len(stamps_ns) - 1, -1, -1):
+        negated = -int(stamps_ns[k])
+        length = bisect_left(firsts, negated)
+        after[k] = starts[length - 1] if length else -1
+        firsts[length : length + 1], starts[length : length + 1] = [negated], [k]
+    run = [starts[-1]]
+    while after[run[-1]] >= 0:
+        run.append(after[run[-1]])
+    return np.array(run, np.int64)
 
 
 def _take_over_times(scan_ns: Stamps, scan_times: Array, motion_ns: Stamps, motion_times: Array) -> None:
@@ -189,7 +226,7 @@ def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:
 
     def read(message: Any) -> tuple[float, float] | None:
         names = list(message.name)
-        if first not in names or second not in names:
+        if first not in names or second not in names or len(message.position) != len(names):
             return None
         return float(message.position[names.index(first)]), float(message.position[names.index(second)])
 
@@ -216,6 +253,7 @@ def _stack_scans(path: Path, messages: list[Any], stamps_ns: Stamps, times: Arra
         row[: len(message.ranges)] = message.ranges
         if message.range_max > 0:
             row[row >= message.range_max] = np.inf
+        row[(row <= 0) | (row < message.range_min)] = np.nan  # nearer than can be measured
     last = messages[-1]
     increment, start, time_increment = float(last.angle_increment), float(last.angle_min), float(last.time_increment)
     if increment < 0:  # a scanner mounted upside down, or a driver that counts clockwise
