@@ -128,6 +128,7 @@ def test_speed_limits_are_approached_with_the_acceleration() -> None:
         ('["a", "b", [36, 4]]', "no room to turn by 135° at"),
         ('["a", [0.2, 0.0], "b"]', "less than a metre apart"),
         ('["a", [20, 12], "b"]', r"w: run r comes within 0.5 m of a wall or through it at \["),
+        ("[[0, 90], [40, 90]]", r"w: run r comes within 0.5 m of a wall or through it at \["),
     ],
 )
 def test_what_cannot_be_driven_is_refused(waypoints: str, message: str) -> None:

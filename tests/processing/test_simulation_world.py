@@ -84,8 +84,10 @@ def test_the_way_between_two_places_follows_the_drift() -> None:
 
 def test_a_choice_of_two_drifts_is_refused_unless_one_is_direct() -> None:
     bow = '[[drifts]]\npoints = ["b", [40, 10], "c"]\nwidth_m = 4.0\n'
-    world = parse_world(WORLD.replace('"a", "c", [-10, 0]', '"b", "c"') + bow, "w.toml")
-    assert len(route(world, world.runs[0])) == 2
+    direct = WORLD.replace('"a", "c", [-10, 0]', '"b", "c"')
+    for text in (direct + bow, direct.replace("[[drifts]]", bow + "[[drifts]]", 1)):
+        world = parse_world(text, "w.toml")
+        assert len(route(world, world.runs[0])) == 2
     two_bows = bow + '[[drifts]]\npoints = ["b", [50, 10], "d"]\nwidth_m = 4.0\n'
     world = parse_world(WORLD.replace('"a", "c", [-10, 0]', '"b", "d"') + two_bows, "w.toml")
     with pytest.raises(BadInputError, match="run r: more than one drift joins b and d"):
