@@ -165,6 +165,15 @@ def _resample(
             whole[row, column] += np.float32(value)
 
 
+def trim(grid: Grid) -> Grid:
+    """The grid without the rows and columns around it of which nothing is known."""
+    rows, columns = (np.flatnonzero(grid.log_odds.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return grid
+    origin = grid.origin + grid.resolution_m * np.array([columns[0], rows[0]])
+    return Grid(grid.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], grid.resolution_m, origin)
+
+
 def _corners(grid: Grid, pose: Array) -> Array:
     """The four corners (4, 2) of the placed grid."""
     height, width = grid.log_odds.shape

@@ -1,5 +1,7 @@
 """A small mine: a loop of 40 × 30 m with four tags, driven by two runs, once around and back the other way."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +66,13 @@ def small_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "small.toml").write_text(SMALL_WORLD, encoding="utf-8")
     simulate(folder / "small.toml", folder / "small")
     return folder / "small"
+
+
+@pytest.fixture(scope="session")
+def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small mine as the program itself maps it, in two processes."""
+    atlas = tmp_path_factory.mktemp("small_atlas") / "small.atlas"
+    recordings = [small_world / "small-around.mcap", small_world / "small-back.mcap"]
+    command = [sys.executable, "-m", "processing.cli", "build", *recordings, "-o", atlas, "--jobs", "2"]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return atlas
