@@ -16,7 +16,7 @@ from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece, bend_to
 from processing.pose_graph import Links
-from processing.registration import register_passes
+from processing.registration import pass_hypotheses
 from processing.scan_matching import Matcher, Scan
 from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
 
@@ -118,8 +118,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
         for v in sorted(v for v, of in boundary.nodes.items() if of == node):
             apart = [u for u in linked if (u, v) not in together]
             for u in apart[:3]:
-                found = register_passes(scans[u], scans[v], solved[0].input.mount)
-                if found is not None:
+                for found in pass_hypotheses(scans[u], scans[v], solved[0].input.mount, only_clear=True):
                     ends.append((u, v))
                     motions.append(found.motion)
                     informations.append(np.linalg.inv(found.covariance))

@@ -14,25 +14,35 @@ from scipy.spatial import cKDTree
 from processing.geometry import accumulate, compose, inverse
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import Scan, score, search_match
+from processing.scan_matching import CLOSEST_M, Scan, agreement, match_scans, search_match
 
 Array = NDArray[np.float64]
 
 SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
 MIN_INLIERS = 0.75
+CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks the same both ways
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
 
 
-def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
-    """Motion of the vehicle from one pass of a tag to another pass of it; None where the scans do not tell."""
-    best: ScanMatch | None = None
+def pass_hypotheses(reference: Scan, current: Scan, mount: Array, only_clear: bool) -> list[ScanMatch]:
+    """Motions of the vehicle from one pass of a tag to another, facing the same way and the other; the better one first.
+
+    With `only_clear`, none where the scans do not tell which way the vehicle was heading.
+    """
+    found: list[tuple[float, ScanMatch]] = []
     for heading in (0.0, np.pi):
         guess = compose(inverse(mount), compose(np.array([0.0, 0.0, heading]), mount))
-        found = search_match(reference, current, guess, SEARCH_M, SEARCH_RAD)
-        if found.converged and found.inliers >= MIN_INLIERS and (best is None or score(found) > score(best)):
-            motion, covariance = through_mount(mount, found.motion, found.covariance)
-            best = replace(found, motion=motion, covariance=covariance)
-    return best
+        match = search_match(reference, current, guess, SEARCH_M, SEARCH_RAD)
+        if match.converged and match.inliers >= MIN_INLIERS:
+            motion, covariance = through_mount(mount, match.motion, match.covariance)
+            # What the other scan should have seen counts as well: one step from there looks without going anywhere.
+            back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
+            worth = min(agreement(match), agreement(back))
+            found.append((worth, replace(match, motion=motion, covariance=covariance)))
+    found.sort(key=lambda of: of[0], reverse=True)
+    is_clear = len(found) == 1 or (len(found) == 2 and found[0][0] - found[1][0] >= CLEARLY_BETTER)
+    chosen = found[: int(is_clear)] if only_clear else found
+    return [match for _, match in chosen]
 
 
 def path_starts(
@@ -51,50 +61,54 @@ def path_starts(
     starts: list[Array] = []
     groups: list[int] = []
     for p in range(len(chains)):
-        placed = None
         for leader in dict.fromkeys(groups):
-            first = groups.index(leader)
-            placed = _place(first, p, poses, scans, ends, mount)
-            if placed is not None and (not same_drift or lies_along(poses[first], compose(placed, poses[p]))):
+            candidates = _places(leader, p, poses, scans, ends, mount, only_clear=not same_drift)
+            if same_drift:
+                candidates = [start for start in candidates if lies_along(poses[leader], compose(start, poses[p]))]
+            if candidates:
                 groups.append(leader)
-                starts.append(placed)
+                starts.append(candidates[0])
                 break
-            placed = None
-        if placed is None:
+        else:
             groups.append(p)
             starts.append(np.zeros(3))
     return starts, groups
 
 
-def _place(
+def _places(
     a: int,
     b: int,
     poses: list[Array],
     scans: list[list[Scan]],
     ends: list[tuple[int | None, int | None]],
     mount: Array,
-) -> Array | None:
-    """Start of path `b` in the frame of path `a`, through a node that both touch."""
-    guesses = []
-    for end_a in (0, -1):
-        for end_b in (0, -1):
-            node = ends[a][end_a]
-            if node is None or node != ends[b][end_b]:
-                continue
-            found = register_passes(scans[a][end_a], scans[b][end_b], mount)
-            if found is not None:
-                return compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b]))
-            guesses.append((end_a, end_b))
-    if not guesses:
-        return None
-    # No scan tells: the tags coincide, and the heading is the one that brings the paths closest together.
-    end_a, end_b = guesses[0]
-    candidates = [
+    only_clear: bool,
+) -> list[Array]:
+    """Starts of path `b` in the frame of path `a`, through a node that both touch: the likeliest first.
+
+    With `only_clear`, those alone whose heading the scans leave no doubt of.
+    """
+    shared = [
+        (end_a, end_b)
+        for end_a in (0, -1)
+        for end_b in (0, -1)
+        if ends[a][end_a] is not None and ends[a][end_a] == ends[b][end_b]
+    ]
+    places = [
+        compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b]))
+        for end_a, end_b in shared
+        for found in pass_hypotheses(scans[a][end_a], scans[b][end_b], mount, only_clear)
+    ]
+    if only_clear:
+        return places
+    # Where no scan tells, the tags coincide; of both headings, the one that brings the paths closer together.
+    tree = cKDTree(poses[a][:, :2])
+    blind = [
         compose(compose(poses[a][end_a], np.array([0.0, 0.0, heading])), inverse(poses[b][end_b]))
+        for end_a, end_b in shared
         for heading in (0.0, np.pi)
     ]
-    tree = cKDTree(poses[a][:, :2])
-    return min(candidates, key=lambda start: float(tree.query(compose(start, poses[b])[:, :2])[0].mean()))
+    return places + sorted(blind, key=lambda start: float(tree.query(compose(start, poses[b])[:, :2])[0].mean()))
 
 
 def lies_along(reference: Array, poses: Array) -> bool:

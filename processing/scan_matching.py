@@ -294,8 +294,13 @@ def search_match(
 
 
 def score(match: ScanMatch) -> float:
-    """How well two scans agree: what matches speaks for it, four times as much what should have and did not against it."""
-    if not match.converged or match.inliers == 0:
+    """How good a match is: how well the scans agree, if it converged."""
+    return agreement(match) if match.converged else -math.inf
+
+
+def agreement(match: ScanMatch) -> float:
+    """What both scans see speaks for a pose, four times as much what one should have seen and did not against it."""
+    if match.inliers == 0:
         return -math.inf
     missing = match.overlap * (1 / match.inliers - 1)
     return match.overlap - 4 * missing - match.residual_m / CLOSEST_M
