@@ -68,10 +68,9 @@ def _interrupt(_number: int, _frame: object) -> None:
 
 
 def _jobs(text: str) -> int:
-    jobs = int(text)
-    if jobs < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is no number of processes")
-    return jobs
+    return int(text)
 
 
 def _build(args: argparse.Namespace) -> None:

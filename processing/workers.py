@@ -25,7 +25,7 @@ class Workers:
 
     def __init__(self, jobs: int) -> None:
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(jobs, context, _leave_interrupt_to_parent) if jobs > 1 else None
+        self._pool = ProcessPoolExecutor(jobs, context) if jobs > 1 else None
 
     def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Raises: RTLogError: a process died; whatever `function` raises."""
@@ -33,8 +33,14 @@ class Workers:
         bar = partial(tqdm, total=len(items), desc=label, disable=None, leave=False)
         if self._pool is None or len(items) < 2:
             return [function(item) for item in bar(items)]
+        # A terminal sends Ctrl-C to every process of a program, and one answers: the others are born deaf to it.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            return list(bar(self._pool.map(function, items)))
+            results = self._pool.map(function, items)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        try:
+            return list(bar(results))
         except BrokenProcessPool as error:
             raise RTLogError("a process died, perhaps for want of memory; try fewer --jobs") from error
 
@@ -48,8 +54,3 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.kill()
         self._pool.shutdown(cancel_futures=True)
-
-
-def _leave_interrupt_to_parent() -> None:
-    """A terminal sends Ctrl-C to every process of a program; one of them answers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

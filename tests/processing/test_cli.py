@@ -1,0 +1,179 @@
+"""`rtlog-atlas` as a user meets it: help at once, answers for scripts, and an end without remains when interrupted."""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-m", "processing.cli"]
+VERBS = ["build", "info", "compare", "simulate", "import"]
+HEAVY = ("numba", "numpy", "PIL", "scipy", "shapely", "zenoh", "tqdm", "mcap")
+
+
+def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *arguments], cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_has_an_example_and_does_not_wait_for_compilers_and_solvers(verb: str) -> None:
+    script = (
+        "import sys, atexit, processing.cli\n"
+        f"atexit.register(lambda: print('loaded:', *[name for name in {HEAVY} if name in sys.modules]))\n"
+        f"processing.cli.main([{verb!r}, '--help'])\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert f"example:\n  rtlog-atlas {verb} " in result.stdout
+    assert result.stdout.splitlines()[-1].strip() == "loaded:"
+
+
+def test_help_lists_the_verbs() -> None:
+    result = run("--help")
+    assert result.returncode == 0
+    assert all(f"\n    {verb} " in result.stdout for verb in VERBS)
+
+
+def test_the_command_is_installed() -> None:
+    program = Path(sys.executable).with_name("rtlog-atlas")
+    result = subprocess.run([program, "info", "--help"], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0
+    assert "usage: rtlog-atlas info" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "which verb?"),
+        (["paint"], "invalid choice: 'paint'"),
+        (["build", "-o", "a.atlas"], "required: RUN.mcap"),
+        (["build", "a.mcap"], "required: -o/--output"),
+        (["build", "a.mcap", "-o", "a.atlas", "--jobs", "0"], "0 is no number of processes"),
+        (["build", "a.mcap", "-o", "a.atlas", "--jobs", "two"], "two is no number of processes"),
+        (["build", "a.mcap", "-o", "a.atlas", "--matcher", "icp"], "invalid choice: 'icp'"),
+        (["import", "rosbag", "a.bag", "-o", "a.mcap"], "invalid choice: 'rosbag'"),
+    ],
+)
+def test_wrong_usage_is_status_2(tmp_path: Path, arguments: list[str], complaint: str) -> None:
+    result = run(*arguments, cwd=tmp_path)
+    assert result.returncode == 2
+    assert complaint in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_info_tells_what_is_in_an_atlas(small_atlas: Path) -> None:
+    result = run("info", small_atlas)
+    assert (result.returncode, result.stderr) == (0, "")
+    kinds = [line.split()[0] for line in result.stdout.splitlines()]
+    assert [kinds.count(kind) for kind in ("run", "node", "edge", "spurs")] == [2, 4, 4, 2]
+    assert "run   small-around: 756 ticks, profile canmet_trailer" in result.stdout
+    assert "E20034120000000000000401" in result.stdout
+
+
+def test_info_for_scripts_is_all_of_atlas_json(small_atlas: Path) -> None:
+    result = run("info", small_atlas, "--json")
+    assert json.loads(result.stdout) == json.loads((small_atlas / "atlas.json").read_text())
+
+
+def test_build_tells_what_it_made_and_leaves_nothing_else(small_world: Path, tmp_path: Path) -> None:
+    recording = small_world / "small-back.mcap"
+    result = run("build", recording, "-o", tmp_path / "a.atlas", "--method", "global", "--json")
+    assert result.returncode == 0
+    summary = json.loads(result.stdout)
+    assert summary.pop("seconds") > 0
+    assert summary == {"atlas": f"{tmp_path}/a.atlas", "runs": 1, "nodes": 0, "edges": 0, "parts": 1}
+    assert all(line.startswith("rtlog-atlas: run small-back ") for line in result.stderr.splitlines())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.atlas"]
+
+
+@contextmanager
+def building(recordings: Path, atlas: Path, jobs: int) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """A build on a terminal of its own, once its progress bar says that it is at work; yields the terminal too."""
+    terminal, its_end = os.openpty()
+    termios.tcsetwinsize(its_end, (24, 100))
+    command = [*COMMAND, "build", *sorted(recordings.glob("*.mcap")), "-o", atlas, "--jobs", str(jobs)]
+    with subprocess.Popen(command, stdout=its_end, stderr=its_end, start_new_session=True) as process:
+        os.close(its_end)
+        try:
+            said = b""
+            while b"runs:" not in said:
+                assert select.select([terminal], [], [], 60)[0], said
+                said += os.read(terminal, 4096)
+            yield process, terminal
+        finally:
+            process.kill()
+            os.close(terminal)
+
+
+def last_words(terminal: int) -> list[str]:
+    """The lines that remain on the terminal until the program closes it; the bars were wiped out."""
+    said = b""
+    try:
+        while select.select([terminal], [], [], 60)[0]:
+            said += os.read(terminal, 4096)
+    except OSError:  # EIO: nobody has the other end open any more
+        pass
+    lines = said.decode().replace("\x1b[A", "").splitlines()
+    return [line for line in lines if line.strip() and "it/s]" not in line and "?it" not in line]
+
+
+def processes_of_session(leader: int) -> list[str]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, _, rest = stat.read_text().rpartition(")")
+        except OSError:  # it ended meanwhile
+            continue
+        if int(rest.split()[3]) == leader and rest.split()[0] != "Z":
+            found.append(name)
+    return found
+
+
+def assert_alone(leader: int) -> None:
+    deadline = time.monotonic() + 10
+    while left := processes_of_session(leader):
+        assert time.monotonic() < deadline, left
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("number", "whole_group", "jobs"),
+    [(signal.SIGINT, True, 2), (signal.SIGTERM, False, 2), (signal.SIGTERM, False, 1)],
+    ids=["Ctrl-C", "SIGTERM", "SIGTERM alone"],
+)
+def test_an_interrupted_build_leaves_nothing_behind(
+    small_world: Path, tmp_path: Path, number: int, whole_group: bool, jobs: int
+) -> None:
+    with building(small_world, tmp_path / "a.atlas", jobs) as (process, terminal):
+        (os.killpg if whole_group else os.kill)(process.pid, number)
+        assert last_words(terminal) == ["rtlog-atlas: interrupted"]
+        assert process.wait(timeout=10) == 130
+        assert_alone(process.pid)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_process_that_dies_is_one_line(small_world: Path, tmp_path: Path) -> None:
+    with building(small_world, tmp_path / "a.atlas", jobs=2) as (process, terminal):
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        deadline = time.monotonic() + 20
+        workers: list[int] = []
+        while not workers:
+            assert time.monotonic() < deadline, "no worker"
+            numbers = [int(number) for number in children.read_text().split()]
+            workers = [n for n in numbers if b"spawn_main" in Path(f"/proc/{n}/cmdline").read_bytes()]
+        os.kill(workers[0], signal.SIGKILL)
+        assert last_words(terminal) == [
+            "rtlog-atlas: a process died, perhaps for want of memory; try fewer --jobs",
+        ]
+        assert process.wait(timeout=10) == 1
+        assert_alone(process.pid)
+    assert not list(tmp_path.iterdir())
