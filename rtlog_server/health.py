@@ -15,6 +15,7 @@ from typing import Any
 from rtlog_server.bundle import DeviceReport, Report, ServerInfo
 from rtlog_server.messages import MISSING, OK, STALE, DiagnosticArray, DiagnosticStatus, KeyValue, header
 from rtlog_server.ticker import TickTime
+from rtlog_server.topics import TICK
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +95,8 @@ def status(info: ServerInfo, report: Report | None, published: dict[str, int]) -
     if report is not None:
         lateness = report.lateness
         answer["ticks"] = {
-            "sampled": lateness.count,
+            # a report is up to a second old; what went out or was dropped since was sampled too
+            "sampled": max(lateness.count, published.get(TICK.name, 0) + report.dropped_ticks),
             "dropped": report.dropped_ticks,
             "overruns": lateness.overruns,
             "lateness_s": {"p50": lateness.p50_s, "p99": lateness.p99_s, "max": lateness.max_s},

@@ -155,7 +155,7 @@ class Device(ABC, Generic[SampleT]):
                 if self.connected or str(error) != self.message:
                     log.warning("%s: %s", self.name, error)
                 self.message = str(error)
-            except Exception as error:  # a fault of the driver, not of the device: no reason to lose the sensor for good
+            except Exception as error:  # a fault of the driver, not of the device: no reason to lose it for good
                 log.exception("%s: fault in the driver", self.name)
                 self.message = f"fault in the driver: {error!r}"
             finally:

@@ -3,8 +3,8 @@
     simulate ─ recording ─ replay --to devices ═ wire ═ rtlog-server ═ zenoh ═ rtlog-client record ─ live recording ┐
         └───── recording of the rest of the drive ──────────────────────────────────────── rtlog-atlas build ── atlas
 
-The first run is played in real time to the emulators of a laser, two encoders and a tag reader; the server samples them as
-it would the devices. Exit status 0: no tick was lost and the map is as near to the truth as it should be.
+The first run is played in real time to the emulators of a laser, two encoders and a tag reader; the server samples
+them as it would the devices. Exit status 0: no tick was lost and the map is as near to the truth as it should be.
 """
 
 import json
