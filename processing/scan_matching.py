@@ -195,7 +195,8 @@ def _gauss_newton(
             mx, my = ref_normals[best, 0], ref_normals[best, 1]
             error = mx * (x - ref_points[best, 0]) + my * (y - ref_points[best, 1])
             variance = ref_variances[best, 0] + RANGE_NOISE_M * RANGE_NOISE_M
-            weight = 1.0 / (variance * (1.0 + error * error / (9.0 * variance)) ** 2)  # Geman-McClure
+            corner = 9.0 * variance + ((reach - CLOSEST_M) / 3.0) ** 2  # wide at first: a poor guess is no outlier
+            weight = 1.0 / (variance * (1.0 + error * error / corner) ** 2)  # Geman-McClure
             turn = -mx * ry + my * rx  # ∂error/∂θ
             matched += 1
             sum_squares += weight * error * error

@@ -4,9 +4,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from processing.pipeline import Config, DrivenRun, drive_through
+from processing.scan_matching import match_scans
 from processing.simulation.simulate import simulate
+from processing.tum import read_tum
 
 SMALL_WORLD = """
 schema = 1
@@ -76,3 +80,31 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     command = [sys.executable, "-m", "processing.cli", "build", *recordings, "-o", atlas, "--jobs", "2"]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     return atlas
+
+
+def drive_both(world: Path) -> list[DrivenRun]:
+    return [drive_through(world / f"small-{run}.mcap", None, match_scans, Config()) for run in ("around", "back")]
+
+
+@pytest.fixture(scope="session")
+def driven(small_world: Path) -> list[DrivenRun]:
+    """Both runs of the small mine, open loop. Leave them as they are."""
+    return drive_both(small_world)
+
+
+@pytest.fixture(scope="session")
+def driven_clean(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> list[DrivenRun]:
+    """The same drives with perfect sensors."""
+    folder = tmp_path_factory.mktemp("clean_world") / "small"
+    simulate(small_world / "world.toml", folder, noise=False)
+    return drive_both(folder)
+
+
+@pytest.fixture(scope="session")
+def truth(small_world: Path, driven: list[DrivenRun]) -> list[np.ndarray]:
+    """The true pose (n, 3) of every scan of both runs, with and without noise."""
+    poses = []
+    for of in driven:
+        stamps, true = read_tum(small_world / f"{of.run.run_id}.tum")
+        poses.append(true[np.searchsorted(stamps, of.run.scans.stamps_ns)])
+    return poses
