@@ -75,7 +75,7 @@ def _node(k: int, runs: list["DrivenRun"], graph: Graph, placement: Placement) -
 
 def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[str, Any]:
     of = piece.solved.input.piece
-    kind = "edge" if of.j is not None else "spurs" if of.i is not None else "run"
+    kind = "edge" if of.j is not None else "spur" if of.i is not None else "run"
     chord = placement.nodes[of.j] - placement.nodes[of.i] if of.i is not None and of.j is not None else None
     strong = strong_links(piece)
     return {

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
@@ -16,7 +18,7 @@ from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece, bend_to
 from processing.pose_graph import Links
-from processing.registration import pass_hypotheses
+from processing.registration import register_passes
 from processing.scan_matching import Matcher, Scan
 from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
 
@@ -107,18 +109,20 @@ def condense_all(solved: list[SolvedPiece], boundary: Boundary) -> list[Condense
 
 
 def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
-    """Links between passes of one tag that no piece has in common."""
+    """Links between passes of one tag in parts of the map that no run joins: all else is joined without guessing."""
     scans: dict[int, Scan] = {}
     for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
         scans |= {v: piece.scans[i] for v, i in zip(variables, indices, strict=True)}
-    together = {(a, b) for piece in boundary.variables for a in piece for b in piece}
+    edges = [(variables[0], v) for variables in boundary.variables for v in variables]
+    shape = (boundary.count, boundary.count)
+    part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
     ends, motions, informations = [], [], []
     for node in sorted(set(boundary.nodes.values())):
         linked: list[int] = []
         for v in sorted(v for v, of in boundary.nodes.items() if of == node):
-            apart = [u for u in linked if (u, v) not in together]
-            for u in apart[:3]:
-                for found in pass_hypotheses(scans[u], scans[v], solved[0].input.mount, only_clear=True):
+            for u in [u for u in linked if part[u] != part[v]][:3]:
+                found = register_passes(scans[u], scans[v], solved[0].input.mount)
+                if found is not None:
                     ends.append((u, v))
                     motions.append(found.motion)
                     informations.append(np.linalg.inv(found.covariance))

@@ -154,25 +154,34 @@ def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Arra
         if frames[root] is not None:
             continue
         frames[root], waiting = np.zeros(3), [root]
-        while waiting:
-            p = waiting.pop(0)
-            frame = frames[p]
-            assert frame is not None
-            placed = [
-                (int(v), compose(frame, at))
-                for v, at in zip(pieces[p].variables, pieces[p].local, strict=True)
-                if part[v] < 0
-            ]
-            while placed:
-                v, pose = placed.pop(0)
+        bridges: list[tuple[int, Array]] = []
+        while waiting or bridges:
+            if not waiting:  # all that shares passes is placed; now what only a link joins
+                v, pose = bridges.pop(0)
                 if part[v] >= 0:
                     continue
                 poses[v], part[v] = pose, parts
-                placed += [(other, compose(pose, motion)) for other, motion in joined[v] if part[other] < 0]
-                for q in members[v]:
-                    if frames[q] is None:
-                        at = pieces[q].local[np.flatnonzero(pieces[q].variables == v)[0]]
-                        frames[q] = compose(pose, inverse(at))
-                        waiting.append(q)
+                waiting += _join_pieces(v, poses[v], pieces, members[v], frames)
+                continue
+            p = waiting.pop(0)
+            frame = frames[p]
+            assert frame is not None
+            for v, at in zip(pieces[p].variables.tolist(), pieces[p].local, strict=True):
+                if part[v] >= 0:
+                    continue
+                poses[v], part[v] = compose(frame, at), parts
+                bridges += [(other, compose(poses[v], motion)) for other, motion in joined[v] if part[other] < 0]
+                waiting += _join_pieces(v, poses[v], pieces, members[v], frames)
         parts += 1
     return poses, part, [frame for frame in frames if frame is not None]
+
+
+def _join_pieces(
+    variable: int, pose: Array, pieces: list[Condensed], members: list[int], frames: list[Array | None]
+) -> list[int]:
+    """Give the pieces that hold a placed variable their frames; those that had none before."""
+    new = [q for q in members if frames[q] is None]
+    for q in new:
+        at = pieces[q].local[np.flatnonzero(pieces[q].variables == variable)[0]]
+        frames[q] = compose(pose, inverse(at))
+    return new

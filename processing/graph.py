@@ -5,11 +5,11 @@ In: the passes of every run, in driving order. Out: nodes, and the pieces of the
     run   ───────●────────────●──────────────●─────────●───
                  A            B              B         C        passes
           spur of A   edge A–B   turn-around     edge B–C  spur of C
-                                 (with B's spurs)
+                                 (spur of B)
 
 The lower EPC is the origin of an edge. A span driven the other way round belongs to the same edge. What touches only
-one node (before the first tag, after the last, out and back) is mapped together as that node's spurs; a run without
-any tag is a piece of its own.
+one node (before the first tag, after the last, out and back) is a spur of that node, each for itself: nothing says yet
+which of them lie in the same drift. A run without any tag is a piece of its own.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """What is mapped in one go: an edge (i < j), the spurs of a node (j None), or a run without tags (both None)."""
+    """What is mapped in one go: an edge (i < j), a spur of a node (j None), or a run without tags (both None)."""
 
     i: int | None
     j: int | None
@@ -58,7 +58,7 @@ def build_graph(passes: Sequence[Sequence[Pass]], scan_counts: Sequence[int]) ->
     epcs = sorted({found.epc for run in passes for found in run})
     number = {epc: k for k, epc in enumerate(epcs)}
     visits: list[list[tuple[int, Pass]]] = [[] for _ in epcs]
-    spans: dict[tuple[int, int, int], list[Span]] = {}
+    spans: dict[tuple[int, int, int, int], list[Span]] = {}
     for run, (found, count) in enumerate(zip(passes, scan_counts, strict=True)):
         for single in found:
             visits[number[single.epc]].append((run, single))
@@ -66,7 +66,7 @@ def build_graph(passes: Sequence[Sequence[Pass]], scan_counts: Sequence[int]) ->
             spans.setdefault(_key(span), []).append(span)
     nodes = tuple(Node(epc, tuple(of)) for epc, of in zip(epcs, visits, strict=True))
     pieces = []
-    for (i, j, _), members in sorted(spans.items()):
+    for (i, j, _, _), members in sorted(spans.items()):
         pieces.append(Piece(i if i >= 0 else None, j if j >= 0 else None, tuple(members)))
     return Graph(nodes, tuple(pieces))
 
@@ -79,11 +79,9 @@ def _cut(run: int, passes: Sequence[Pass], count: int, number: dict[str, int]) -
     return [Span(run, first, last, start, end) for (first, start), (last, end) in pairwise(cuts) if last > first]
 
 
-def _key(span: Span) -> tuple[int, int, int]:
-    """Spans with the same key are mapped together. Runs without tags stay alone."""
+def _key(span: Span) -> tuple[int, int, int, int]:
+    """Spans with the same key are mapped together: those of an edge. All others stay alone."""
     ends = sorted(node for node in (span.start, span.end) if node is not None)
-    if not ends:
-        return (-1, -1, span.run)
-    if len(ends) == 1 or ends[0] == ends[1]:
-        return (ends[0], -1, 0)
-    return (ends[0], ends[1], 0)
+    if len(ends) == 2 and ends[0] != ends[1]:
+        return (ends[0], ends[1], 0, 0)
+    return (ends[0] if ends else -1, -1, span.run, span.first)

@@ -88,7 +88,6 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
         scans=[path.scans for path in given.paths],
         ends=[(span.start, span.end) for span in given.piece.spans],
         mount=given.mount,
-        same_drift=given.piece.j is not None,
     )
     out = []
     for number, leader in enumerate(dict.fromkeys(groups)):

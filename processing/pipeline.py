@@ -4,6 +4,7 @@ recordings ─ read_log ─ open_loop ─ beacons ─┐
                                              graph ─ pieces (edge_map) ─ assembly ─ grids ─ Atlas
 """
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from processing.atlas import Atlas
 from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass, find_passes, overlapping_passes
 from processing.edge_placement import Placed, Placement, place_by_frames
-from processing.graph import Piece, build_graph
+from processing.graph import Graph, Piece, build_graph
 from processing.length_placement import place_by_lengths
 from processing.occupancy_grid import Grid
 from processing.odometry import dead_reckon
@@ -69,7 +70,7 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, jobs:
     with Workers(jobs) as work:
         runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
         graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
-        inputs = [piece_input(piece, runs) for piece in graph.pieces]
+        inputs = [piece_input(name, piece, runs) for name, piece in zip(piece_names(graph), graph.pieces, strict=True)]
         solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
         place = place_by_frames if config.assembly == "refined" else place_by_lengths
         placed = place(solved, graph, match)
@@ -91,17 +92,27 @@ def drive_through(recording: Path, profile: Profile | None, match: Matcher, conf
     return DrivenRun(run, loop, passes)
 
 
-def piece_input(piece: Piece, runs: list[DrivenRun]) -> PieceInput:
+def piece_names(graph: Graph) -> list[str]:
+    """`i-j` for an edge, `i-spur`, `i-spur2` … for the spurs of a node, `run-k` for a run without tags."""
+    names, spurs = [], Counter[int | None]()
+    for piece in graph.pieces:
+        if piece.j is not None:
+            names.append(f"{piece.i}-{piece.j}")
+        elif piece.i is None:
+            names.append(f"run-{piece.spans[0].run}")
+        else:
+            spurs[piece.i] += 1
+            names.append(f"{piece.i}-spur{spurs[piece.i] if spurs[piece.i] > 1 else ''}")
+    return names
+
+
+def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
     cuts = [
         cut_span(
             runs[s.run].run.run_id, runs[s.run].loop, runs[s.run].run.scans.ranges, runs[s.run].run.scans.angles, s
         )
         for s in piece.spans
     ]
-    if piece.j is not None:
-        name = f"{piece.i}-{piece.j}"
-    else:
-        name = f"{piece.i}-spurs" if piece.i is not None else f"run-{piece.spans[0].run}"
     paths, sights = (tuple(column) for column in zip(*cuts, strict=True))
     return PieceInput(name, piece, paths, sights, mount_pose(runs[piece.spans[0].run].run))
 

@@ -24,11 +24,21 @@ CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks 
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
 
 
-def pass_hypotheses(reference: Scan, current: Scan, mount: Array, only_clear: bool) -> list[ScanMatch]:
-    """Motions of the vehicle from one pass of a tag to another, facing the same way and the other; the better one first.
+def pass_hypotheses(reference: Scan, current: Scan, mount: Array) -> list[ScanMatch]:
+    """Motions of the vehicle from one pass of a tag to another, facing the same way and the other; the better first."""
+    return [match for _, match in _weigh_headings(reference, current, mount)]
 
-    With `only_clear`, none where the scans do not tell which way the vehicle was heading.
+
+def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
+    """The motion from one pass to another; None where the scans do not tell, or not which way the vehicle was heading.
     """
+    found = _weigh_headings(reference, current, mount)
+    if not found or (len(found) > 1 and found[0][0] - found[1][0] < CLEARLY_BETTER):
+        return None
+    return found[0][1]
+
+
+def _weigh_headings(reference: Scan, current: Scan, mount: Array) -> list[tuple[float, ScanMatch]]:
     found: list[tuple[float, ScanMatch]] = []
     for heading in (0.0, np.pi):
         guess = compose(inverse(mount), compose(np.array([0.0, 0.0, heading]), mount))
@@ -39,10 +49,7 @@ def pass_hypotheses(reference: Scan, current: Scan, mount: Array, only_clear: bo
             back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
             worth = min(agreement(match), agreement(back))
             found.append((worth, replace(match, motion=motion, covariance=covariance)))
-    found.sort(key=lambda of: of[0], reverse=True)
-    is_clear = len(found) == 1 or (len(found) == 2 and found[0][0] - found[1][0] >= CLEARLY_BETTER)
-    chosen = found[: int(is_clear)] if only_clear else found
-    return [match for _, match in chosen]
+    return sorted(found, key=lambda of: of[0], reverse=True)
 
 
 def path_starts(
@@ -50,24 +57,21 @@ def path_starts(
     scans: list[list[Scan]],  # per path
     ends: list[tuple[int | None, int | None]],  # nodes at the first and last key frame of each path
     mount: Array,
-    same_drift: bool,
 ) -> tuple[list[Array], list[int]]:
     """The start of each path (3,) in the frame of the first path of its group, and each path's group.
 
-    The first path of a group starts at zero. With `same_drift`, paths of one group lie in the same drift; without,
-    they only have a tag in common.
+    The first path of a group starts at zero. Paths of one group lie in the same drift.
     """
     poses = [accumulate(np.zeros(3), chain.motions) for chain in chains]
     starts: list[Array] = []
     groups: list[int] = []
     for p in range(len(chains)):
         for leader in dict.fromkeys(groups):
-            candidates = _places(leader, p, poses, scans, ends, mount, only_clear=not same_drift)
-            if same_drift:
-                candidates = [start for start in candidates if lies_along(poses[leader], compose(start, poses[p]))]
-            if candidates:
+            candidates = _places(leader, p, poses, scans, ends, mount)
+            placed = next((at for at in candidates if lies_along(poses[leader], compose(at, poses[p]))), None)
+            if placed is not None:
                 groups.append(leader)
-                starts.append(candidates[0])
+                starts.append(placed)
                 break
         else:
             groups.append(p)
@@ -82,12 +86,8 @@ def _places(
     scans: list[list[Scan]],
     ends: list[tuple[int | None, int | None]],
     mount: Array,
-    only_clear: bool,
 ) -> list[Array]:
-    """Starts of path `b` in the frame of path `a`, through a node that both touch: the likeliest first.
-
-    With `only_clear`, those alone whose heading the scans leave no doubt of.
-    """
+    """Starts of path `b` in the frame of path `a`, through a node that both touch: the likeliest first."""
     shared = [
         (end_a, end_b)
         for end_a in (0, -1)
@@ -97,10 +97,8 @@ def _places(
     places = [
         compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b]))
         for end_a, end_b in shared
-        for found in pass_hypotheses(scans[a][end_a], scans[b][end_b], mount, only_clear)
+        for found in pass_hypotheses(scans[a][end_a], scans[b][end_b], mount)
     ]
-    if only_clear:
-        return places
     # Where no scan tells, the tags coincide; of both headings, the one that brings the paths closer together.
     tree = cKDTree(poses[a][:, :2])
     blind = [

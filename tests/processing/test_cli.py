@@ -97,7 +97,7 @@ def test_build_tells_what_it_made_and_leaves_nothing_else(small_world: Path, tmp
 
 @contextmanager
 def building(recordings: Path, atlas: Path, jobs: int) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """A build on a terminal of its own, once its progress bar says that it is at work; yields the terminal too."""
+    """A build on a terminal of its own, once it is at work, and its workers too; yields the terminal as well."""
     terminal, its_end = os.openpty()
     termios.tcsetwinsize(its_end, (24, 100))
     command = [*COMMAND, "build", *sorted(recordings.glob("*.mcap")), "-o", atlas, "--jobs", str(jobs)]
@@ -108,10 +108,19 @@ def building(recordings: Path, atlas: Path, jobs: int) -> Iterator[tuple[subproc
             while b"runs:" not in said:
                 assert select.select([terminal], [], [], 60)[0], said
                 said += os.read(terminal, 4096)
+            deadline = time.monotonic() + 20
+            while len(workers_of(process.pid)) < (jobs if jobs > 1 else 0):
+                assert time.monotonic() < deadline, "no workers"
             yield process, terminal
         finally:
             process.kill()
             os.close(terminal)
+
+
+def workers_of(parent: int) -> list[int]:
+    """The processes of a pool that have come as far as to load their compiler."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [int(child) for child in children if "llvmlite" in Path(f"/proc/{child}/maps").read_text()]
 
 
 def last_words(terminal: int) -> list[str]:
@@ -163,14 +172,7 @@ def test_an_interrupted_build_leaves_nothing_behind(
 
 def test_a_process_that_dies_is_one_line(small_world: Path, tmp_path: Path) -> None:
     with building(small_world, tmp_path / "a.atlas", jobs=2) as (process, terminal):
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-        deadline = time.monotonic() + 20
-        workers: list[int] = []
-        while not workers:
-            assert time.monotonic() < deadline, "no worker"
-            numbers = [int(number) for number in children.read_text().split()]
-            workers = [n for n in numbers if b"spawn_main" in Path(f"/proc/{n}/cmdline").read_bytes()]
-        os.kill(workers[0], signal.SIGKILL)
+        os.kill(workers_of(process.pid)[0], signal.SIGKILL)
         assert last_words(terminal) == [
             "rtlog-atlas: a process died, perhaps for want of memory; try fewer --jobs",
         ]
