@@ -224,7 +224,7 @@ def _stretches(frames: KeyFrames, chain: Links, members: Ints) -> list[Ints]:
 
 
 def _joins(paths: list[Path], firsts: Ints) -> Links:
-    """All that is known without strong links of where a path begins: what its tag says. Keeps the graph in one piece."""
+    """All that is known without strong links of where a path begins: what its tag says. Keeps the graph whole."""
     ends = np.column_stack([np.zeros(len(paths) - 1, np.int64), firsts[1:-1]])
     motions = [relative(paths[0].start, path.start) for path in paths[1:]]
     informations = np.tile(np.diag([TAG_M**-2, TAG_M**-2, TAG_RAD**-2]), (len(motions), 1, 1))

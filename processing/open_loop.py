@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from hw_profiles.profile import OdometryNoise
 from processing.fusion import consistent, fuse
 from processing.geometry import accumulate, compose, compose_jacobians, inverse
+from processing.match_search import search_match
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run, Scans
 from processing.scan_match import through_mount
-from processing.scan_matching import Matcher, Scan, match_scans, prepare_scan, search_match
+from processing.scan_matching import Matcher, Scan, match_scans, prepare_scan
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from processing.geometry import accumulate, compose, inverse
+from processing.match_search import agreement, search_match
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import CLOSEST_M, Scan, agreement, match_scans, search_match
+from processing.scan_matching import CLOSEST_M, Scan, match_scans
 
 Array = NDArray[np.float64]
 
@@ -30,8 +31,7 @@ def pass_hypotheses(reference: Scan, current: Scan, mount: Array) -> list[ScanMa
 
 
 def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
-    """The motion from one pass to another; None where the scans do not tell, or not which way the vehicle was heading.
-    """
+    """The motion from one pass to another; None where the scans do not tell, or not which way the vehicle was heading."""
     found = _weigh_headings(reference, current, mount)
     if not found or (len(found) > 1 and found[0][0] - found[1][0] < CLEARLY_BETTER):
         return None

@@ -1,8 +1,8 @@
 """Relocation: where a key frame lies on the map so far, when open loop has strayed too far for a match from there.
 
-In: a scan, a guess and how wrong it may be; key frames with known poses. Out: the best pose. Every pose of a window around
-the guess is tried on a likelihood field (Olson 2009, correlative scan matching, in its plain form): an image of the known
-walls, blurred by as much as one step of the search, in which the moved points of the scan are looked up and added.
+In: a scan, a guess and how wrong it may be; key frames with known poses. Out: the best pose. Every pose of a window
+around the guess is tried on a likelihood field (Olson 2009, correlative scan matching, in its plain form): an image of
+the known walls, blurred by as much as one step of the search, in which the points of the scan are looked up and added.
 """
 
 import math
@@ -12,8 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.geometry import compose, inverse, relative, transform, wrap_angle
+from processing.match_search import score
 from processing.pose_graph import Links
-from processing.scan_matching import Scan, score
+from processing.scan_matching import Scan
 from processing.strong_links import KeyFrames, match_vehicles
 
 Array = NDArray[np.float64]
@@ -108,7 +109,7 @@ def _search(
 ) -> tuple[tuple[float, float, float], float]:
     """The shift [cells] and the number of the heading with the largest sum of the field under the points."""
     height, width = field.shape
-    cells = int(math.ceil(radius))
+    cells = math.ceil(radius)
     side = 2 * cells + 1
     best, best_sum = (0.0, 0.0, 0.0), -1.0
     sums = np.zeros((side, side), np.int32)
@@ -116,8 +117,8 @@ def _search(
         c, s = math.cos(headings[k]), math.sin(headings[k])
         sums[:] = 0
         for i in range(len(points)):
-            column = int(math.floor(start[0] + c * points[i, 0] - s * points[i, 1])) - cells
-            row = int(math.floor(start[1] + s * points[i, 0] + c * points[i, 1])) - cells
+            column = math.floor(start[0] + c * points[i, 0] - s * points[i, 1]) - cells
+            row = math.floor(start[1] + s * points[i, 0] + c * points[i, 1]) - cells
             low, high = max(0, -column), min(side, width - column)
             for dy in range(max(0, -row), min(side, height - row)):
                 for dx in range(low, high):

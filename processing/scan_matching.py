@@ -35,7 +35,6 @@ PRETENCE = 3.0  # information less than so many times what noisy normals pretend
 MIN_MATCHED = 10  # points, and
 MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
 CLOSEST_M = 0.25  # pairs of points further apart than this are no pairs, once the guess has become good
-SEARCH_TURN_RAD = 0.15
 LEVER_M = 5.0  # a typical distance to the walls
 MODEL_NOISE_M = 0.002  # what matching on other points of a rough wall leaves, however many beams see it
 
@@ -270,38 +269,3 @@ def match_scans(
     if not converged:
         motion, covariance = np.array(guess, dtype=np.float64), np.eye(3) * UNSEEN_VARIANCE
     return ScanMatch(motion, covariance, matched / max(visible, 1), rms, converged, matched / max(valid, 1))
-
-
-def search_match(
-    reference: Scan, current: Scan, guess: Array, radius_m: float, radius_rad: float, reach_m: float = 1.0
-) -> ScanMatch:
-    """The best match from starts spread over a radius around the guess: for guesses too poor for `match_scans` alone.
-
-    Best is what `score` says.
-    """
-    shifts = np.arange(-np.ceil(radius_m / reach_m), np.ceil(radius_m / reach_m) + 1) * reach_m
-    turns = np.linspace(-radius_rad, radius_rad, 2 * int(np.ceil(radius_rad / SEARCH_TURN_RAD)) + 1)
-    best: ScanMatch | None = None
-    for dx in shifts:
-        for dy in shifts:
-            if np.hypot(dx, dy) > radius_m + 1e-9:
-                continue
-            for turn in turns:
-                found = match_scans(reference, current, guess + np.array([dx, dy, turn]), reach_m)
-                if best is None or score(found) > score(best):
-                    best = found
-    assert best is not None  # the guess itself is always tried
-    return best
-
-
-def score(match: ScanMatch) -> float:
-    """How good a match is: how well the scans agree, if it converged."""
-    return agreement(match) if match.converged else -math.inf
-
-
-def agreement(match: ScanMatch) -> float:
-    """What both scans see speaks for a pose, four times as much what one should have seen and did not against it."""
-    if match.inliers == 0:
-        return -math.inf
-    missing = match.overlap * (1 / match.inliers - 1)
-    return match.overlap - 4 * missing - match.residual_m / CLOSEST_M

@@ -1,0 +1,52 @@
+"""Searching for a match where the guess is poor, and judging which of several matches is the right one.
+
+In: two scans and a guess. Out: a `ScanMatch`. A match can converge anywhere in a drift; what tells the right place is that
+nearly all that both scans must see agrees, not how much of it there is.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.scan_match import ScanMatch
+from processing.scan_matching import CLOSEST_M, Scan, match_scans
+
+Array = NDArray[np.float64]
+
+SEARCH_TURN_RAD = 0.15
+
+
+def search_match(
+    reference: Scan, current: Scan, guess: Array, radius_m: float, radius_rad: float, reach_m: float = 1.0
+) -> ScanMatch:
+    """The best match from starts spread over a radius around the guess: for guesses too poor for `match_scans` alone.
+
+    Best is what `score` says.
+    """
+    shifts = np.arange(-np.ceil(radius_m / reach_m), np.ceil(radius_m / reach_m) + 1) * reach_m
+    turns = np.linspace(-radius_rad, radius_rad, 2 * int(np.ceil(radius_rad / SEARCH_TURN_RAD)) + 1)
+    best: ScanMatch | None = None
+    for dx in shifts:
+        for dy in shifts:
+            if np.hypot(dx, dy) > radius_m + 1e-9:
+                continue
+            for turn in turns:
+                found = match_scans(reference, current, guess + np.array([dx, dy, turn]), reach_m)
+                if best is None or score(found) > score(best):
+                    best = found
+    assert best is not None  # the guess itself is always tried
+    return best
+
+
+def score(match: ScanMatch) -> float:
+    """How good a match is: how well the scans agree, if it converged."""
+    return agreement(match) if match.converged else -math.inf
+
+
+def agreement(match: ScanMatch) -> float:
+    """What both scans see speaks for a pose, four times as much what one should have seen and did not against it."""
+    if match.inliers == 0:
+        return -math.inf
+    missing = match.overlap * (1 / match.inliers - 1)
+    return match.overlap - 4 * missing - match.residual_m / CLOSEST_M
