@@ -1,7 +1,7 @@
-# Six verbs. `make demo` and `make test` set themselves up on a bare machine.
+# `make demo` and `make test` set themselves up on a bare machine.
 PY := .venv/bin/python
 
-.PHONY: demo test lint bench hil docs lock
+.PHONY: demo test lint lock
 
 demo: .venv/ready
 	$(PY) tests/system/demo.py

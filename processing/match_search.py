@@ -1,7 +1,7 @@
 """Searching for a match where the guess is poor, and judging which of several matches is the right one.
 
-In: two scans and a guess. Out: a `ScanMatch`. A match can converge anywhere in a drift; what tells the right place is that
-nearly all that both scans must see agrees, not how much of it there is.
+In: two scans and a guess. Out: a `ScanMatch`. A match can converge anywhere in a drift; what tells the right place is
+that nearly all that both scans must see agrees, not how much of it there is.
 """
 
 import math

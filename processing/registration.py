@@ -31,7 +31,7 @@ def pass_hypotheses(reference: Scan, current: Scan, mount: Array) -> list[ScanMa
 
 
 def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
-    """The motion from one pass to another; None where the scans do not tell, or not which way the vehicle was heading."""
+    """The motion from one pass to another; None where the scans do not tell it, or not which way the vehicle faced."""
     found = _weigh_headings(reference, current, mount)
     if not found or (len(found) > 1 and found[0][0] - found[1][0] < CLEARLY_BETTER):
         return None

@@ -8,8 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from processing.geometry import compose, inverse, rotation, wrap_angle
+from processing.match_search import score, search_match
 from processing.scan_match import ScanMatch
-from processing.scan_matching import UNSEEN_VARIANCE, Scan, match_scans, prepare_scan, score, search_match
+from processing.scan_matching import UNSEEN_VARIANCE, Scan, match_scans, prepare_scan
 from processing.simulation.raycast import SegmentGrid, build_grid, cast
 from processing.simulation.walls import periodic_noise
 
