@@ -36,14 +36,14 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Array]:
         if not words or words[0].startswith("#"):
             continue
         if len(words) != 8:
-            raise BadInputError(f"{path}: line {number}: {len(words)} numbers instead of 8")
+            raise BadInputError(f"{path}, line {number}: {len(words)} numbers instead of 8")
         try:
             stamps.append(np.int64(int(Decimal(words[0]).scaleb(9))))  # exact, also as 1.4036e+09
             rows.append([float(word) for word in words[1:]])
         except (ValueError, ArithmeticError) as error:
-            raise BadInputError(f"{path}: line {number}: not a number among {line.strip()!r}") from error
+            raise BadInputError(f"{path}, line {number}: not a number among {line.strip()!r}") from error
         if not np.all(np.isfinite(rows[-1])):
-            raise BadInputError(f"{path}: line {number}: a pose that is not finite")
+            raise BadInputError(f"{path}, line {number}: a pose that is not finite")
     values = np.array(rows).reshape(-1, 7)
     x, y, _, qx, qy, qz, qw = values.T
     heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))

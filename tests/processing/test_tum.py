@@ -69,7 +69,7 @@ def test_a_malformed_line_is_named(tmp_path: Path, line: str, complaint: str) ->
     path.write_text(f"# t x y z qx qy qz qw\n1.0 2 3 0 0 0 0 1\n{line}\n")
     with pytest.raises(BadInputError) as raised:
         read_tum(path)
-    assert str(raised.value).startswith(f"{path}: line 3: {complaint}")
+    assert str(raised.value).startswith(f"{path}, line 3: {complaint}")
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
