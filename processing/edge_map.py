@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry import accumulate, relative
-from processing.pose_graph import Links, Solution, solve
+from processing.pose_graph import CORNER, Links, Solution, solve
 from processing.relocation import NO_LINKS, relocate_stretch
 from processing.scan_matching import Matcher, Scan
 from processing.strong_links import (
@@ -33,6 +33,7 @@ Ints = NDArray[np.int64]
 STRETCH_M = 5.0
 FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this share match, are no closed loop
 LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
+GRADUAL = (1e7, 1e6, 1e5, 1e4, 1e3, 1e2, CORNER)
 MAX_ROUNDS = 5
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
@@ -159,7 +160,7 @@ def _close(
             if lost and not len(found):
                 break
             if len(found):
-                tried = _solve_present(poses, links + found, present)
+                tried = _solve_present(poses, links + found, present, GRADUAL)
         pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
         closed = match_pairs(frames, tried, pairs, LOOP_INLIERS)
         if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
@@ -188,14 +189,19 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
     return PieceMap(solution.poses, firsts, believed, solution)
 
 
-def _solve_present(poses: Array, links: Links, present: NDArray[np.bool_]) -> Array:
-    """Solve for the key frames that are there already; the others wait."""
+def _solve_present(
+    poses: Array, links: Links, present: NDArray[np.bool_], corners: tuple[float, ...] = (CORNER,)
+) -> Array:
+    """Solve for the key frames that are there already; the others wait. With falling corners (graduated non-convexity),
+    links that are far from fulfilled at first get their chance before they are doubted.
+    """
     numbers = np.cumsum(present) - 1
     inside = np.flatnonzero(np.all(present[links.ends], axis=1))
     part = links[inside]
     part = Links(numbers[part.ends], part.motions, part.informations, part.robust)
     solved = poses.copy()
-    solved[present] = solve(poses[present], part, max_iterations=10).poses
+    for corner in corners:
+        solved[present] = solve(solved[present], part, corner=corner, max_iterations=4).poses
     return solved
 
 

@@ -23,9 +23,10 @@ Ints = NDArray[np.int64]
 CELL_M = 0.15
 MAX_POINTS = 180  # of a scan, evenly chosen: more only make it slower
 MAX_RANGE_M = 15.0
-TRIES = 6  # key frames of a stretch
-MIN_SHARE = 0.5  # of a scan's points on walls
-MIN_SCORE = 0.3
+TRIES = 8  # key frames of a stretch
+NEIGHBOURS = 5  # known key frames that each is matched to
+MIN_SHARE = 0.4  # of a scan's points on walls
+MIN_SCORE, MIN_TOGETHER = 0.1, 0.6  # of one match, of all that agree
 AGREE_M, AGREE_RAD = 1.0, 0.15
 NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)
 
@@ -77,28 +78,33 @@ def relocate_stretch(
     if len(known) < 2 or len(stretch) < 2:
         return NO_LINKS
     field, origin = likelihood_field([frames.scans[k] for k in known], compose(poses[known], frames.mount))
-    ends, motions, informations, shifts = [], [], [], []
+    ends, motions, informations, shifts, worths = [], [], [], [], []
     for k in stretch[np.unique(np.linspace(0, len(stretch) - 1, TRIES).astype(int))]:
         place, share = relocate(frames.scans[k], field, origin, poses[k], frames.mount, radius_m, radius_rad)
         if share < MIN_SHARE:
             continue
-        near = known[np.argmin(np.hypot(*(poses[known, :2] - place[:2]).T))]
-        guess = relative(poses[near], place)
-        found = match_vehicles(frames.scans[near], frames.scans[k], guess, frames.mount, frames.match)
-        if score(found) < MIN_SCORE:
+        order = np.argsort(np.hypot(*(poses[known, :2] - place[:2]).T), kind="stable")
+        tried = []
+        for near in known[order[:NEIGHBOURS]]:
+            guess = relative(poses[near], place)
+            found = match_vehicles(frames.scans[near], frames.scans[k], guess, frames.mount, frames.match)
+            tried.append((score(found), int(near), found))
+        worth, i, found = max(tried, key=lambda of: of[0])
+        if worth < MIN_SCORE:
             continue
-        ends.append((int(near), int(k)))
+        ends.append((i, int(k)))
         motions.append(found.motion)
         informations.append(np.linalg.inv(found.covariance))
-        shifts.append(compose(compose(poses[near], found.motion), inverse(poses[k])))
+        shifts.append(compose(compose(poses[i], found.motion), inverse(poses[k])))
+        worths.append(worth)
     if not shifts:
         return NO_LINKS
     moved = np.array([[*transform(shift, middle), shift[2]] for shift in shifts])
     apart = np.abs(moved[:, None] - moved[None])
     apart[..., 2] = np.abs(wrap_angle(apart[..., 2]))
     agree = (np.hypot(apart[..., 0], apart[..., 1]) < AGREE_M) & (apart[..., 2] < AGREE_RAD)
-    best = int(np.argmax(agree.sum(axis=1)))
-    if agree[best].sum() < 2:
+    best = int(np.argmax(agree @ np.array(worths)))
+    if agree[best].sum() < 2 or agree[best] @ np.array(worths) < MIN_TOGETHER:
         return NO_LINKS
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)[np.flatnonzero(agree[best])]
 
