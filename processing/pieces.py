@@ -5,6 +5,7 @@ computed from its own arrays alone, so pieces can be solved in any order and any
 """
 
 from dataclasses import dataclass, replace
+from string import ascii_lowercase
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,7 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
         chosen = [p for p, group in enumerate(groups) if group == leader]
         out.append(
             PieceInput(
-                given.name + ("" if number == 0 else "bcdefghijklmnopqrstuvwxyz"[min(number - 1, 24)]),
+                given.name + drift_suffix(number),
                 replace(given.piece, spans=tuple(given.piece.spans[p] for p in chosen)),
                 tuple(replace(given.paths[p], start=starts[p]) for p in chosen),
                 tuple(given.sights[p] for p in chosen),
@@ -102,6 +103,13 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
             )
         )
     return out
+
+
+def drift_suffix(number: int) -> str:
+    """Nothing for the first drift between two tags, then b, c … z, z2, z3 …: each piece has a name of its own."""
+    if number == 0:
+        return ""
+    return ascii_lowercase[number] if number < 26 else f"z{number - 24}"
 
 
 def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:

@@ -75,7 +75,7 @@ def test_info_tells_what_is_in_an_atlas(small_atlas: Path) -> None:
     result = run("info", small_atlas)
     assert (result.returncode, result.stderr) == (0, "")
     kinds = [line.split()[0] for line in result.stdout.splitlines()]
-    assert [kinds.count(kind) for kind in ("run", "node", "edge", "spurs")] == [2, 4, 4, 2]
+    assert [kinds.count(kind) for kind in ("run", "node", "edge", "spur")] == [2, 4, 4, 5]
     assert "run   small-around: 756 ticks, profile canmet_trailer" in result.stdout
     assert "E20034120000000000000401" in result.stdout
 

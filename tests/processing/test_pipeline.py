@@ -14,6 +14,7 @@ from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
 from processing.atlas import Atlas, read_document, write_atlas
 from processing.geometry import align, compose, transform, wrap_angle
+from processing.pieces import drift_suffix
 from processing.pipeline import Config, build
 from processing.tum import read_tum
 from rtlog_client.log_file import LoggedMessage, LogWriter, read_info, read_messages
@@ -52,7 +53,7 @@ def short(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> P
 def test_one_process_or_two_give_the_same_bytes(atlas: Atlas, small_atlas: Path, tmp_path: Path) -> None:
     write_atlas(tmp_path / "again.atlas", atlas)
     names = sorted(str(path.relative_to(small_atlas)) for path in small_atlas.rglob("*") if path.is_file())
-    assert len(names) == 1 + 6 + 2 + 3
+    assert len(names) == 1 + 9 + 2 + 3
     for name in names:
         assert (tmp_path / "again.atlas" / name).read_bytes() == (small_atlas / name).read_bytes(), name
 
@@ -121,11 +122,13 @@ def test_both_ways_and_both_runs_share_an_edge(atlas: Atlas) -> None:
 
 
 def test_a_turn_around_is_a_spur_of_its_tag(atlas: Atlas) -> None:
-    spurs = next(edge for edge in atlas.document["edges"] if edge["id"] == "0-spurs")
-    of_back = [path for path in spurs["paths"] if path["run"] == "small-back"]
-    away_and_back, last = of_back
-    assert away_and_back["from"] > 0
-    assert away_and_back["to"] == last["from"]
+    spurs = [
+        edge for edge in atlas.document["edges"] if edge["kind"] == "spur" and edge["paths"][0]["run"] == "small-back"
+    ]
+    assert [(edge["i"], edge["j"], len(edge["paths"])) for edge in spurs] == [(0, None, 1), (0, None, 1), (1, None, 1)]
+    out_and_back, last, first = (edge["paths"][0] for edge in spurs)
+    assert first["from"] == 0
+    assert out_and_back["to"] == last["from"] > out_and_back["from"] > first["to"]
     assert last["to"] == 431
 
 
@@ -174,6 +177,12 @@ def test_a_named_profile_wins_over_the_one_inside(short: Path) -> None:
     assert names == {"inside": "canmet_trailer", "named": "mended"}
     inside, named = (found.trajectories["short"][1] for found in runs.values())
     assert np.abs(inside - named).max() > 0.01  # it was not only the name that was taken
+
+
+def test_drifts_between_the_same_tags_have_names_of_their_own() -> None:
+    names = [drift_suffix(number) for number in range(100)]
+    assert names[:3] == ["", "b", "c"]
+    assert len(set(names)) == 100
 
 
 def test_the_same_run_twice_is_refused_before_any_work(recordings: list[Path], tmp_path: Path) -> None:
