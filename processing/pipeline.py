@@ -65,7 +65,7 @@ class DrivenRun:
 
 def build(recordings: list[Path], profile: Profile | None, config: Config, jobs: int = 1) -> Atlas:
     """Map recordings. Raises: BadInputError: a recording is unfit, or two of them are the same run."""
-    _refuse_twins(recordings)
+    _check_run_ids(recordings)
     match = MATCHERS[config.matcher]
     with Workers(jobs) as work:
         runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
@@ -136,11 +136,13 @@ def remarks(runs: list[DrivenRun], placed: Placement) -> list[str]:
     return out + placed.remarks
 
 
-def _refuse_twins(recordings: list[Path]) -> None:
+def _check_run_ids(recordings: list[Path]) -> None:
     """Before any work, so that a slip of the hand is told at once."""
     seen: dict[str, Path] = {}
     for path in recordings:
         run_id = read_info(path).run_id
+        if run_id in ("", ".", "..") or "/" in run_id:
+            raise BadInputError(f"{path}: the run is called {run_id!r}, which no file can be")
         if run_id in seen:
             raise BadInputError(f"{seen[run_id]} and {path} are the same run, {run_id}")
         seen[run_id] = path

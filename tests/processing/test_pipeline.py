@@ -195,6 +195,13 @@ def test_the_same_run_twice_is_refused_before_any_work(recordings: list[Path], t
     assert time.monotonic() - began < 1
 
 
+@pytest.mark.parametrize("run_id", ["../../etc/motd", "..", ""])
+def test_a_run_does_not_choose_where_it_is_written(recordings: list[Path], tmp_path: Path, run_id: str) -> None:
+    named = rewrite(recordings[1], tmp_path / "a.mcap", lambda m: m.topic == "/rtlog/tick", {"run_id": run_id})
+    with pytest.raises(BadInputError, match=r"a\.mcap: the run is called '.*', which no file can be"):
+        build([named], None, Config())
+
+
 def test_a_recording_too_short_to_map_is_named(recordings: list[Path], tmp_path: Path) -> None:
     start_ns = read_info(recordings[1]).start_ns
     brief = rewrite(recordings[1], tmp_path / "brief.mcap", lambda m: m.log_time_ns < start_ns + 500_000_000)
