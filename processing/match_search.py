@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.scan_match import ScanMatch
-from processing.scan_matching import CLOSEST_M, Scan, match_scans
+from processing.scan_matching import Scan, match_scans
 
 Array = NDArray[np.float64]
 
 SEARCH_TURN_RAD = 0.15
+POOR_RESIDUAL_M = 0.025  # points this far off the walls they were drawn to say nothing; right matches leave half of it
 
 
 def search_match(
@@ -45,8 +46,10 @@ def score(match: ScanMatch) -> float:
 
 
 def agreement(match: ScanMatch) -> float:
-    """What both scans see speaks for a pose, four times as much what one should have seen and did not against it."""
+    """What both scans see speaks for a pose; against it speaks, four times as much, what one should have seen and did
+    not, and points that lie less closely on the walls than noise and roughness let them.
+    """
     if match.inliers == 0:
         return -math.inf
-    missing = match.overlap * (1 / match.inliers - 1)
-    return match.overlap - 4 * missing - match.residual_m / CLOSEST_M
+    missing = 1 / match.inliers - 1
+    return match.overlap * (1 - 4 * missing - (match.residual_m / POOR_RESIDUAL_M) ** 2)

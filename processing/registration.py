@@ -48,7 +48,8 @@ def _weigh_headings(reference: Scan, current: Scan, mount: Array) -> list[tuple[
             # What the other scan should have seen counts as well: one step from there looks without going anywhere.
             back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
             worth = min(agreement(match), agreement(back))
-            found.append((worth, replace(match, motion=motion, covariance=covariance)))
+            if worth > 0:
+                found.append((worth, replace(match, motion=motion, covariance=covariance)))
     return sorted(found, key=lambda of: of[0], reverse=True)
 
 

@@ -1,0 +1,156 @@
+"""Passes of one tag registered by their scans; paths that share their tags, and those that share their drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from processing.geometry import accumulate, compose, relative, wrap_angle
+from processing.graph import build_graph
+from processing.open_loop import mount_pose
+from processing.pieces import split_drifts
+from processing.pipeline import DrivenRun, piece_input
+from processing.registration import lies_along, pass_hypotheses, path_starts, register_passes
+from processing.scan_matching import Scan, prepare_scan
+
+STRAIGHT = np.column_stack([np.arange(0, 80, 0.75), np.zeros(107), np.zeros(107)])
+
+
+def scan_of(of: DrivenRun, k: int) -> Scan:
+    return prepare_scan(of.loop.points[k], of.run.scans.angle_min, of.run.scans.angle_increment)
+
+
+def bow(height_m: float) -> np.ndarray:
+    """A path between the ends of the straight one."""
+    x = STRAIGHT[:, 0]
+    y = height_m * np.sin(np.pi * x / x[-1])
+    return np.column_stack([x, y, np.arctan2(np.gradient(y), np.gradient(x))])
+
+
+def drifting(poses: np.ndarray, share: float) -> np.ndarray:
+    """The same drive, its heading lost by and by: by the end it is a share of its length off."""
+    motions = relative(poses[:-1], poses[1:])
+    motions[:, 2] += 2 * share / len(motions)
+    return accumulate(poses[0], motions)
+
+
+def backwards(poses: np.ndarray) -> np.ndarray:
+    """Driven the other way, as seen in the same frame."""
+    turned = poses[::-1].copy()
+    turned[:, 2] = wrap_angle(turned[:, 2] + np.pi)
+    return turned
+
+
+def assert_near(motion: np.ndarray, true: np.ndarray, metres: float, degrees: float) -> None:
+    assert np.hypot(*(motion - true)[:2]) < metres
+    assert abs(wrap_angle(motion[2] - true[2])) < np.radians(degrees)
+
+
+@pytest.mark.parametrize("offset_m", [-1.5, 0.0, 1.5])
+def test_passes_of_a_tag_are_found_from_a_metre_and_a_half_off(
+    driven: list[DrivenRun], truth: list[np.ndarray], offset_m: float
+) -> None:
+    """Every two passes of one tag, in the same or the opposite direction, one of them read too late or too early."""
+    mount, ways, tried = mount_pose(driven[0].run), [], 0
+    way = [np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))) for poses in truth]
+    passes = [(run, found) for run, of in enumerate(driven) for found in of.passes]
+    for n, (run_a, a) in enumerate(passes):
+        for run_b, b in passes[n + 1 :]:
+            if a.epc != b.epc:
+                continue
+            i, j = a.centre, int(np.searchsorted(way[run_b], way[run_b][b.centre] + offset_m))
+            true = relative(truth[run_a][i], truth[run_b][j])
+            if np.hypot(*true[:2]) > 2.0:
+                continue
+            found = pass_hypotheses(scan_of(driven[run_a], i), scan_of(driven[run_b], j), mount)
+            assert_near(found[0].motion, true, 0.03, 0.6)
+            ways.append(bool(abs(true[2]) > np.pi / 2))
+            tried += 1
+    assert tried >= 4
+    assert set(ways) == {True, False}
+
+
+def test_scans_of_different_places_are_hardly_ever_taken_for_one(
+    driven: list[DrivenRun], truth: list[np.ndarray]
+) -> None:
+    """Drifts look alike to a scanner that sees 4 m of wall on either side: one in ten may pass."""
+    of, mount, rng = driven[0], mount_pose(driven[0].run), np.random.default_rng(1)
+    pairs = rng.integers(0, len(truth[0]), (40, 2))
+    apart = pairs[np.hypot(*(truth[0][pairs[:, 0], :2] - truth[0][pairs[:, 1], :2]).T) > 6]
+    found = [register_passes(scan_of(of, i), scan_of(of, j), mount) for i, j in apart]
+    assert len(found) > 20
+    assert sum(match is not None for match in found) <= len(found) // 10
+
+
+def test_a_scanner_that_saw_nothing_tells_nothing(driven: list[DrivenRun]) -> None:
+    scan = scan_of(driven[0], 100)
+    blind = prepare_scan(np.full_like(scan.points, np.nan), scan.angle_min, scan.angle_increment)
+    for a, b in ((scan, blind), (blind, scan)):
+        assert pass_hypotheses(a, b, np.zeros(3)) == []
+        assert register_passes(a, b, np.zeros(3)) is None
+
+
+@pytest.mark.parametrize("share", [-0.02, 0.0, 0.02])
+def test_a_path_in_the_same_drift_lies_along(share: float) -> None:
+    beside = STRAIGHT + np.array([0.0, 1.5, 0.0])
+    for other in (STRAIGHT, beside, backwards(STRAIGHT), backwards(beside), bow(1.5)):
+        assert lies_along(STRAIGHT, drifting(other, share))
+
+
+def test_a_path_in_another_drift_does_not() -> None:
+    for height in (8.0, 12.0, -20.0):
+        assert not lies_along(STRAIGHT, bow(height))
+        assert not lies_along(bow(height), STRAIGHT)
+    turned = compose(np.array([0.0, 0.0, 0.5]), STRAIGHT)  # from the same tag, another way
+    assert not lies_along(STRAIGHT, turned)
+
+
+def test_paths_both_ways_through_an_edge_start_where_they_did(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
+    """Each path of an edge in the frame of its first, open loop: what map_piece begins with."""
+    graph = build_graph([of.passes for of in driven], [len(of.loop.points) for of in driven])
+    shared = [piece for piece in graph.pieces if piece.j is not None and len(piece.spans) > 1]
+    assert any(a.start == b.end for piece in shared for a in piece.spans[:1] for b in piece.spans[1:])
+    for piece in shared:
+        (given,) = split_drifts(piece_input("edge", piece, driven))
+        first = truth[piece.spans[0].run][piece.spans[0].first]
+        for span, path in zip(piece.spans, given.paths, strict=True):
+            assert_near(path.start, relative(first, truth[span.run][span.first]), 0.25, 2.0)
+
+
+def test_two_drifts_between_the_same_tags_become_two_pieces(driven: list[DrivenRun]) -> None:
+    """With only two of its tags read, the ring is two drifts from the one to the other: east and west."""
+    tags = sorted({found.epc for found in driven[0].passes})
+    seen = [[found for found in of.passes if found.epc in (tags[0], tags[2])] for of in driven]
+    graph = build_graph(seen, [len(of.loop.points) for of in driven])
+    (edge,) = [piece for piece in graph.pieces if piece.j is not None]
+    assert len(edge.spans) >= 2
+    east, west = split_drifts(piece_input("0-1", edge, driven))
+    assert (east.name, west.name) == ("0-1", "0-1b")
+    assert len(east.paths) == len(east.piece.spans) == len(east.sights)
+    assert len(east.paths) + len(west.paths) == len(edge.spans)
+    assert set(east.piece.spans).isdisjoint(west.piece.spans)
+    for part in (east, west):
+        assert np.all(part.paths[0].start == 0)
+
+
+def test_a_stray_path_without_a_common_tag_is_a_group_of_its_own(driven: list[DrivenRun]) -> None:
+    loop = driven[0].loop
+    chain, scans = loop.links[np.arange(20)], loop.scans[:21]
+    starts, groups = path_starts([chain] * 3, [scans] * 3, [(0, 1), (2, 3), (0, 1)], mount_pose(driven[0].run))
+    assert groups == [0, 1, 0]
+    assert np.all(starts[0] == 0)
+    assert np.all(starts[1] == 0)
+    assert_near(starts[2], np.zeros(3), 0.01, 0.1)
+
+
+def test_where_no_scan_tells_the_tags_coincide(driven: list[DrivenRun]) -> None:
+    """A path the other way, its scans all blind: the heading is the one that lays the paths together."""
+    loop, mount = driven[0].loop, mount_pose(driven[0].run)
+    chain, scans = loop.links[np.arange(40)], loop.scans[:41]
+    there = accumulate(np.zeros(3), chain.motions)
+    back = backwards(there)
+    chain_back = replace(chain, motions=relative(back[:-1], back[1:]))
+    blind = [prepare_scan(np.full_like(scan.points, np.nan), scan.angle_min, scan.angle_increment) for scan in scans]
+    starts, groups = path_starts([chain, chain_back], [scans, blind], [(0, 1), (1, 0)], mount)
+    assert groups == [0, 0]
+    assert_near(starts[1], back[0], 0.05, 1.0)
