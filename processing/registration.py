@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
 MIN_INLIERS = 0.75
+MIN_WORTH = 0.1  # by agreement: one pair of different places in twenty has as much, nineteen of twenty passes more
 CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks the same both ways
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
 
@@ -48,7 +49,7 @@ def _weigh_headings(reference: Scan, current: Scan, mount: Array) -> list[tuple[
             # What the other scan should have seen counts as well: one step from there looks without going anywhere.
             back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
             worth = min(agreement(match), agreement(back))
-            if worth > 0:
+            if worth > MIN_WORTH:
                 found.append((worth, replace(match, motion=motion, covariance=covariance)))
     return sorted(found, key=lambda of: of[0], reverse=True)
 
