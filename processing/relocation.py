@@ -26,7 +26,8 @@ MAX_RANGE_M = 15.0
 TRIES = 8  # key frames of a stretch
 NEIGHBOURS = 5  # known key frames that each is matched to
 MIN_SHARE = 0.4  # of a scan's points on walls
-MIN_SCORE, MIN_TOGETHER = 0.1, 0.6  # of one match, of all that agree
+MIN_SCORE, MIN_TOGETHER = 0.1, 0.8  # of one match, of all that agree
+MIN_AGREEING = 0.5  # of those that were tried
 AGREE_M, AGREE_RAD = 1.0, 0.15
 NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)
 
@@ -79,7 +80,8 @@ def relocate_stretch(
         return NO_LINKS
     field, origin = likelihood_field([frames.scans[k] for k in known], compose(poses[known], frames.mount))
     ends, motions, informations, shifts, worths = [], [], [], [], []
-    for k in stretch[np.unique(np.linspace(0, len(stretch) - 1, TRIES).astype(int))]:
+    tries = stretch[np.unique(np.linspace(0, len(stretch) - 1, TRIES).astype(int))]
+    for k in tries:
         place, share = relocate(frames.scans[k], field, origin, poses[k], frames.mount, radius_m, radius_rad)
         if share < MIN_SHARE:
             continue
@@ -104,7 +106,7 @@ def relocate_stretch(
     apart[..., 2] = np.abs(wrap_angle(apart[..., 2]))
     agree = (np.hypot(apart[..., 0], apart[..., 1]) < AGREE_M) & (apart[..., 2] < AGREE_RAD)
     best = int(np.argmax(agree @ np.array(worths)))
-    if agree[best].sum() < 2 or agree[best] @ np.array(worths) < MIN_TOGETHER:
+    if agree[best].sum() < max(2, MIN_AGREEING * len(tries)) or agree[best] @ np.array(worths) < MIN_TOGETHER:
         return NO_LINKS
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)[np.flatnonzero(agree[best])]
 
