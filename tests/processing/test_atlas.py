@@ -248,6 +248,8 @@ def test_every_edge_has_its_arrays(small_atlas: Path) -> None:
             assert arrays["link_ends"].max() < count
             strong = arrays["link_strong"]
             assert edge["links"] == {"weak": int((~strong).sum()), "strong": int(strong.sum())}
+            doubt = np.linalg.inv(arrays["link_informations"][strong])[:, :2, :2]
+            assert np.linalg.eigvalsh(doubt)[:, 0].max() < 0.5**2  # a match of scans knows better than a tag
             assert_allclose(  # the poses fit the links that they come from
                 relative(*(arrays["poses"][arrays["link_ends"][strong][:, k]] for k in (0, 1)))[:, :2],
                 arrays["link_motions"][strong][:, :2],

@@ -155,6 +155,7 @@ CASES = [
     ("rtlog-atlas build good.mcap copy.mcap -o a.atlas", r"good\.mcap and copy\.mcap are the same run, good"),
     # where the output cannot go
     ("rtlog-atlas build good.mcap -o there.atlas", r"there\.atlas exists already; it is left as it is"),
+    ("rtlog-atlas build none.mcap -o there.atlas", r"there\.atlas exists already; .*"),  # told before any work
     ("rtlog-atlas build good.mcap -o good.mcap", r"good\.mcap exists already; it is left as it is"),
     ("rtlog-atlas build good.mcap -o none/a.atlas", r"none: no such folder"),
     ("rtlog-atlas simulate world.toml -o there.atlas", r"there\.atlas exists already; it is left as it is"),
