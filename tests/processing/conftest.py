@@ -2,12 +2,17 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from processing.pipeline import Config, DrivenRun, drive_through
+from processing.edge_placement import Placed
+from processing.geometry import align, compose
+from processing.graph import Graph, build_graph
+from processing.pieces import SolvedPiece, solve_piece
+from processing.pipeline import Config, DrivenRun, drive_through, piece_input, piece_names
 from processing.scan_matching import match_scans
 from processing.simulation.simulate import simulate
 from processing.tum import read_tum
@@ -108,3 +113,47 @@ def truth(small_world: Path, driven: list[DrivenRun]) -> list[np.ndarray]:
         stamps, true = read_tum(small_world / f"{of.run.run_id}.tum")
         poses.append(true[np.searchsorted(stamps, of.run.scans.stamps_ns)])
     return poses
+
+
+def solve_pieces(driven: list[DrivenRun]) -> tuple[Graph, list[SolvedPiece]]:
+    graph = build_graph([of.passes for of in driven], [len(of.loop.points) for of in driven])
+    inputs = [piece_input(name, piece, driven) for name, piece in zip(piece_names(graph), graph.pieces, strict=True)]
+    return graph, [part for given in inputs for part in solve_piece(given, match_scans)]
+
+
+@pytest.fixture(scope="session")
+def solve_runs() -> Callable[[list[DrivenRun]], tuple[Graph, list[SolvedPiece]]]:
+    """solve_runs(driven): the graph of driven runs and its pieces, solved."""
+    return solve_pieces
+
+
+@pytest.fixture(scope="session")
+def solved(driven: list[DrivenRun]) -> tuple[Graph, list[SolvedPiece]]:
+    """The graph of the small mine and its pieces. Leave them as they are."""
+    return solve_pieces(driven)
+
+
+@pytest.fixture(scope="session")
+def true_keyframes(truth: list[np.ndarray]) -> Callable[[SolvedPiece, list[DrivenRun]], np.ndarray]:
+    """true_keyframes(piece, driven): the true poses (N, 3) of the piece's key frames."""
+
+    def of_piece(piece: SolvedPiece, driven: list[DrivenRun]) -> np.ndarray:
+        pairs = zip(piece.input.piece.spans, piece.input.paths, strict=True)
+        return np.concatenate([truth[s.run][driven[s.run].loop.keyframes[path.keyframes]] for s, path in pairs])
+
+    return of_piece
+
+
+@pytest.fixture(scope="session")
+def move_into_world(
+    true_keyframes: Callable[[SolvedPiece, list[DrivenRun]], np.ndarray],
+) -> Callable[[list[Placed], list[DrivenRun]], tuple[np.ndarray, np.ndarray]]:
+    """move_into_world(pieces, driven): the move (3,) of all as one, and how far off (N,) m they are then."""
+
+    def move(pieces: list[Placed], driven: list[DrivenRun]) -> tuple[np.ndarray, np.ndarray]:
+        placed = np.concatenate([piece.poses for piece in pieces])
+        true = np.concatenate([true_keyframes(piece.solved, driven) for piece in pieces])
+        into_world = align(placed[:, :2], true[:, :2])
+        return into_world, np.hypot(*(compose(into_world, placed) - true)[:, :2].T)
+
+    return move
