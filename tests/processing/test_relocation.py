@@ -1,5 +1,7 @@
 """Relocation: a key frame far from where it was thought to be is found on the map, and chance is not believed."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -22,7 +24,7 @@ def walls(seed: int) -> np.ndarray:
     out = []
     for x0, y0, x1, y1 in boxes:
         corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
-        out += [[*a, *b] for a, b in zip(corners, corners[1:], strict=False)]
+        out += [[*a, *b] for a, b in pairwise(corners)]
     return np.array(out)
 
 
