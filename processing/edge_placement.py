@@ -220,9 +220,14 @@ def _settle(
         atlas_poses = piece.map.poses + np.array([shifts[part], 0.0, 0.0])
         frame = edge_frame(piece, nodes, atlas_poses)
         placed.append(Placed(piece, frame, relative(frame, atlas_poses), part))
-    if max(parts, default=0) > 0:
-        notes.append(f"the map falls into {max(parts) + 1} unconnected parts; they are laid out side by side")
-    return Placement(placed, nodes, parts_of_nodes, notes)
+    return Placement(placed, nodes, parts_of_nodes, notes + remark_parts(parts))
+
+
+def remark_parts(parts: list[int]) -> list[str]:
+    """What to tell of the part of every piece."""
+    if max(parts, default=0) == 0:
+        return []
+    return [f"the map falls into {max(parts) + 1} unconnected parts; they are laid out side by side"]
 
 
 def edge_frame(piece: SolvedPiece, nodes: Array, poses: Array) -> Array:

@@ -9,37 +9,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.assembly import Assembly, assemble_paper, turn_from_headings
-from processing.edge_placement import Placed, Placement, find_boundary, lay_side_by_side, link_nodes
+from processing.edge_placement import Placed, Placement, find_boundary, lay_side_by_side, link_nodes, remark_parts
 from processing.geometry import compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece
 from processing.scan_matching import Matcher
 
 Array = NDArray[np.float64]
+Key = tuple[int, int]  # of a pass: run, scan
 
 
 def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher) -> Placement:
-    """The paper's assembly of all edges; spurs are hung on the edges that they share a pass with."""
+    """The paper's assembly of all edges; spurs are hung on what they share a pass with, or else a tag."""
     edges = [p for p, piece in enumerate(solved) if piece.input.piece.j is not None]
     local = [relative(_own_frame(piece), piece.map.poses) for piece in solved]
-    assembly = _assemble(solved, edges, local, graph)
+    links = _links_of_passes(solved)
+    assembly = _assemble(solved, edges, local, graph, links)
     frames, parts = [np.zeros(3) for _ in solved], [-1 for _ in solved]
-    passes: dict[tuple[int, int], tuple[Array, int]] = {}  # (run, scan) → pose in the atlas, part
+    passes: dict[Key, tuple[Array, int]] = {}  # pose in the atlas, part
     for p in edges:
         i, j = (assembly.positions[node] for node in _nodes_of(solved[p]))
         frames[p] = np.array([*i, np.arctan2(*(j - i)[::-1])])
         parts[p] = int(assembly.parts[_nodes_of(solved[p])[0]])
         for key, _, index in _passes_of(solved[p]):
             passes.setdefault(key, (compose(frames[p], local[p][index]), parts[p]))
-    for p in range(len(solved)):
-        if p in edges:
-            continue
-        shared = [(*passes[key], index) for key, _, index in _passes_of(solved[p]) if key in passes]
-        if shared:
-            pose, parts[p], index = shared[0]
+    waiting = [p for p in range(len(solved)) if p not in edges]
+    while waiting:  # a spur may hang on another spur; one that hangs on nothing begins a part
+        holds = {p: hold for p in waiting if (hold := _find_hold(solved[p], passes, links)) is not None}
+        p = next(iter(holds), waiting[0])
+        waiting.remove(p)
+        parts[p] = len(graph.nodes) + p
+        if p in holds:
+            pose, parts[p], index = holds[p]
             frames[p] = compose(pose, inverse(local[p][index]))
-        else:
-            parts[p] = len(graph.nodes) + p  # a part of its own
+        for key, _, index in _passes_of(solved[p]):
+            passes.setdefault(key, (compose(frames[p], local[p][index]), parts[p]))
     parts = np.unique(parts, return_inverse=True)[1].tolist()
     shifts = lay_side_by_side([compose(frame, poses) for frame, poses in zip(frames, local, strict=True)], parts)
     placed = [
@@ -51,7 +55,31 @@ def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher) -
         for _, node, index in _passes_of(of.solved):
             if node_parts[node] < 0:
                 nodes[node], node_parts[node] = of.poses[index], of.part
-    return Placement(placed, nodes, node_parts, _remarks(solved, edges, assembly))
+    return Placement(placed, nodes, node_parts, _remarks(solved, edges, assembly) + remark_parts(parts))
+
+
+def _links_of_passes(solved: list[SolvedPiece]) -> list[tuple[Key, Key, Array]]:
+    """Passes that no drive joins, and the motion (3,) from the first to the second that their scans tell."""
+    boundary = find_boundary(solved)
+    key_of = {variable: key for key, variable in boundary.passes.items()}
+    links = link_nodes(solved, boundary)
+    return [(key_of[u], key_of[v], motion) for (u, v), motion in zip(links.ends.tolist(), links.motions, strict=True)]
+
+
+def _find_hold(
+    piece: SolvedPiece, passes: dict[Key, tuple[Array, int]], links: list[tuple[Key, Key, Array]]
+) -> tuple[Array, int, int] | None:
+    """What is known in the atlas of a pass of this piece: its pose, the part, and which pose of the piece it is."""
+    own = {key: index for key, _, index in _passes_of(piece)}
+    for key, index in own.items():
+        if key in passes:
+            return (*passes[key], index)
+    for u, v, motion in links:
+        for known, unknown, way in ((u, v, motion), (v, u, inverse(motion))):
+            if known in passes and unknown in own:
+                pose, part = passes[known]
+                return compose(pose, way), part, own[unknown]
+    return None
 
 
 def _nodes_of(edge: SolvedPiece) -> tuple[int, int]:
@@ -74,8 +102,8 @@ def _own_frame(piece: SolvedPiece) -> Array:
     return np.array([origin[0], origin[1], np.arctan2(end[1] - origin[1], end[0] - origin[0])])
 
 
-def _passes_of(piece: SolvedPiece) -> list[tuple[tuple[int, int], int, int]]:
-    """(run, scan), node and pose of every pass that ends a path of the piece."""
+def _passes_of(piece: SolvedPiece) -> list[tuple[Key, int, int]]:
+    """Key, node and pose of every pass that ends a path of the piece."""
     out = []
     for k, span in enumerate(piece.input.piece.spans):
         for index, scan, node in zip(piece.ends(k), (span.first, span.last), (span.start, span.end), strict=True):
@@ -84,10 +112,16 @@ def _passes_of(piece: SolvedPiece) -> list[tuple[tuple[int, int], int, int]]:
     return out
 
 
-def _assemble(solved: list[SolvedPiece], edges: list[int], local: list[Array], graph: Graph) -> Assembly:
+def _assemble(
+    solved: list[SolvedPiece],
+    edges: list[int],
+    local: list[Array],
+    graph: Graph,
+    links: list[tuple[Key, Key, Array]],
+) -> Assembly:
     ends = np.array([_nodes_of(solved[p]) for p in edges], np.int64).reshape(-1, 2)
     lengths = []
-    headings: dict[tuple[int, int], list[tuple[int, float]]] = {}
+    headings: dict[Key, list[tuple[int, float]]] = {}
     for number, p in enumerate(edges):
         a, b = solved[p].ends(0)
         lengths.append(float(np.hypot(*(local[p][b, :2] - local[p][a, :2]))))
@@ -96,11 +130,7 @@ def _assemble(solved: list[SolvedPiece], edges: list[int], local: list[Array], g
     # A drive from one edge into the next: the pass is one pose, seen from both edges, and δ of eq. 5 is zero.
     joints = [(key, key, 0.0) for key, pair in headings.items() if len(pair) == 2]
     # Passes that no drive joins: δ is what their scans say.
-    boundary = find_boundary(solved)
-    key_of = {variable: key for key, variable in boundary.passes.items()}
-    links = link_nodes(solved, boundary)
-    for (u, v), motion in zip(links.ends.tolist(), links.motions, strict=True):
-        joints.append((key_of[u], key_of[v], float(motion[2])))
+    joints += [(u, v, float(motion[2])) for u, v, motion in links]
     turns = [
         (a, b, float(turn_from_headings(alpha, delta, beta)))
         for first, second, delta in joints
