@@ -16,6 +16,7 @@ from hw_profiles.errors import BadInputError
 from processing.geometry import Array
 from processing.occupancy_grid import Grid
 
+Image.MAX_IMAGE_PIXELS = None  # a mine of kilometres is no attack
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # pixels
 OCCUPIED_ABOVE = 1.0  # log-odds: more than a single hit
 FREE_BELOW = -0.3  # log-odds: one look is enough
