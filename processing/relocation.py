@@ -34,9 +34,10 @@ NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), rob
 
 def likelihood_field(scans: list[Scan], laser_poses: Array) -> tuple[NDArray[np.uint8], Array]:
     """The walls (H, W) seen by key frames: 4 on a wall, less beside it; and the corner (2,) of cell [0, 0]."""
-    points = np.concatenate(
-        [transform(pose, _points(scan)) for scan, pose in zip(scans, laser_poses, strict=True)] or [np.zeros((1, 2))]
-    )
+    seen = [transform(pose, _points(scan)) for scan, pose in zip(scans, laser_poses, strict=True)]
+    points = np.concatenate([np.zeros((0, 2)), *seen])
+    if not len(points):
+        return np.zeros((1, 1), np.uint8), np.zeros(2)
     origin = points.min(axis=0) - 2 * CELL_M
     size = np.ceil((points.max(axis=0) - origin) / CELL_M).astype(int) + 2
     field = np.zeros((size[1], size[0]), np.uint8)

@@ -1,0 +1,194 @@
+"""Closed-loop pieces of the small mine: nearer to the truth than open loop, and not to be bent by lies."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from processing.edge_map import MAX_DRIFT_M, MAX_DRIFT_RAD, Drift, Path, map_piece
+from processing.geometry import accumulate, align, compose, relative, wrap_angle
+from processing.graph import Graph
+from processing.open_loop import mount_pose
+from processing.pieces import SolvedPiece
+from processing.pipeline import DrivenRun
+from processing.pose_graph import Links
+from processing.scan_match import ScanMatch
+from processing.scan_matching import Scan, match_scans
+from processing.strong_links import LOOP_SPACING_M, KeyFrames, hop_pairs, loop_pairs, worth_a_link
+
+Solved = tuple[Graph, list[SolvedPiece]]
+Truth = Callable[[SolvedPiece, list[DrivenRun]], np.ndarray]
+
+
+def off(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """How far (N,) m the poses are off, moved as one."""
+    return np.hypot(*(compose(align(poses[:, :2], truth[:, :2]), poses) - truth)[:, :2].T)
+
+
+def whole_run(of: DrivenRun) -> Path:
+    loop = of.loop
+    return Path(of.run.run_id, np.arange(len(loop.keyframes)), loop.scans, loop.links, loop.wheels, np.zeros(3))
+
+
+def turn_aside(path: Path, at: int, radians: float) -> Path:
+    """The path with one link of its chain turned, as by a wrong match in a bend; the wheels are right about it."""
+    motions = path.chain.motions.copy()
+    motions[at, 2] += radians
+    return replace(path, chain=replace(path.chain, motions=motions))
+
+
+def frames_along(x: np.ndarray, drive: np.ndarray) -> KeyFrames:
+    """Key frames without scans, for what is chosen by place alone."""
+    return KeyFrames([], drive, x, np.zeros(3), match_scans)
+
+
+def test_a_run_that_meets_its_own_beginning_closes(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
+    """Without any tag: a loop of 140 m and half of it again."""
+    path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
+    piece = map_piece([path], mount_pose(driven[0].run), match_scans)
+    open_loop = accumulate(np.zeros(3), path.chain.motions)
+    assert off(piece.poses, true).max() < 0.08
+    assert off(piece.poses, true).max() < 0.5 * off(open_loop, true).max()
+    ends = piece.links.ends[piece.links.robust]
+    way = np.append(0.0, np.cumsum(np.hypot(*path.chain.motions[:, :2].T)))
+    assert np.sum(np.abs(np.diff(way[ends], axis=1)) > 100) > 10
+    assert piece.solution.converged
+    assert_allclose(piece.poses[0], 0, atol=1e-9)
+
+
+def test_a_chain_with_a_wrong_turn_is_mended(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
+    """The wheels, and hops over the fault, outvote it: it does not bend the drift, nor keep the loop from closing."""
+    path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
+    astray = turn_aside(path, 60, 0.2)
+    bent = off(accumulate(np.zeros(3), astray.chain.motions), true).max()
+    piece = map_piece([astray], mount_pose(driven[0].run), match_scans)
+    assert bent > 2.0
+    assert off(piece.poses, true).max() < 0.1
+    assert not np.any(np.all(piece.links.ends == [60, 61], axis=1) & piece.links.robust)  # the liar is gone
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_strong_links_that_lie_bend_nothing(driven: list[DrivenRun], truth: list[np.ndarray], seed: int) -> None:
+    """One match in seven is off by up to a metre and half a radian, and sure of itself."""
+    rng = np.random.default_rng(seed)
+
+    def liar(reference: Scan, current: Scan, guess: np.ndarray) -> ScanMatch:
+        found = match_scans(reference, current, guess)
+        lie = rng.uniform(-1, 1, 3) * [1, 1, 0.5] if rng.random() < 1 / 7 else np.zeros(3)
+        return replace(found, motion=found.motion + lie)
+
+    path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
+    piece = map_piece([path], mount_pose(driven[0].run), liar)
+    assert off(piece.poses, true).max() < 0.12
+
+
+def test_paths_of_an_edge_lie_over_each_other_whichever_way_they_were_driven(
+    solved: Solved, driven: list[DrivenRun], true_keyframes: Truth
+) -> None:
+    """Strong links join them; the relative pose between any two key frames is right to centimetres."""
+    both_ways = 0
+    for piece in solved[1]:
+        paths = len(piece.input.paths)
+        if paths < 2:
+            continue
+        true, firsts = true_keyframes(piece, driven), piece.map.firsts
+        assert off(piece.map.poses, true).max() < 0.05
+        ends = piece.map.links.ends[piece.map.links.robust]
+        across = np.searchsorted(firsts, ends, side="right")
+        assert np.sum(across[:, 0] != across[:, 1]) >= 5 * (paths - 1)
+        i, k = firsts[0], firsts[1] - 1
+        for p in range(1, paths):
+            j = piece.map.path(p).start
+            error = relative(relative(true[i], true[j]), relative(piece.map.poses[i], piece.map.poses[j]))
+            assert np.hypot(*error[:2]) < 0.05
+            assert abs(error[2]) < np.radians(0.5)
+            headings = true[piece.map.path(p), 2][:, None] - true[i : k + 1, 2]
+            both_ways += (
+                np.abs(wrap_angle(headings)).min() > 1.0
+                or piece.input.piece.spans[p].start != piece.input.piece.spans[0].start
+            )
+    assert both_ways
+
+
+@pytest.mark.parametrize("error", [(1.5, -1.0, 0.0), (-2.0, 1.5, 0.25)])
+def test_a_poor_start_of_a_second_path_is_made_good(
+    solved: Solved, driven: list[DrivenRun], true_keyframes: Truth, error: tuple[float, float, float]
+) -> None:
+    """As where no scan told where the tag was passed."""
+    piece = next(piece for piece in solved[1] if len(piece.input.paths) > 1)
+    first, second = piece.input.paths[:2]
+    poor = replace(second, start=compose(second.start, np.array(error)))
+    found = map_piece([first, poor], piece.input.mount, match_scans)
+    assert off(found.poses, true_keyframes(piece, driven)[: len(found.poses)]).max() < 0.06
+
+
+def test_two_key_frames_are_a_piece(driven: list[DrivenRun]) -> None:
+    """The shortest spur: from the start of a run to a tag beside it."""
+    loop = driven[0].loop
+    path = Path("short", np.arange(2), loop.scans[:2], loop.links[np.arange(1)], loop.wheels[np.arange(1)], np.zeros(3))
+    piece = map_piece([path], mount_pose(driven[0].run), match_scans)
+    assert piece.firsts.tolist() == [0, 2]
+    gap = relative(piece.poses[0], piece.poses[1]) - loop.links.motions[0]
+    assert np.hypot(*gap[:2]) < 0.01
+
+
+def test_a_blind_scanner_leaves_the_wheels(driven: list[DrivenRun]) -> None:
+    """No scan holds anything: the piece is what odometry makes of it, and no link is invented."""
+    loop, mount = driven[0].loop, mount_pose(driven[0].run)
+    blind = replace(loop.scans[0], points=np.full((541, 2), np.nan), normals=np.full((541, 2), np.nan))
+    path = whole_run(driven[0])
+    wheels = Links(path.wheels.ends, path.wheels.motions, path.wheels.informations, np.ones(len(path.wheels), bool))
+    piece = map_piece([replace(path, scans=[blind] * len(loop.scans), chain=wheels)], mount, match_scans)
+    assert_allclose(piece.poses[:, :2], accumulate(np.zeros(3), path.wheels.motions)[:, :2], atol=1e-3)
+    assert len(piece.links) == 2 * len(path.wheels)
+
+
+def test_a_drive_strays_further_the_longer_it_goes(driven: list[DrivenRun]) -> None:
+    chain, drift, radii = driven[0].loop.links, Drift(), [0.0]
+    assert drift.radius_m == drift.radius_rad == 0
+    for first in range(0, 180, 20):
+        drift = drift.after(chain[np.arange(first, first + 20)])
+        radii.append(drift.radius_m)
+    assert np.all(np.diff(radii) > 0)
+    whole = Drift().after(chain[np.arange(180)])
+    assert drift.radius_m == pytest.approx(whole.radius_m, rel=0.05)  # in parts or at once
+    assert drift.radius_rad == pytest.approx(whole.radius_rad)
+    hopeless = Drift(1e6, 1e6)
+    assert (hopeless.radius_m, hopeless.radius_rad) == (MAX_DRIFT_M, MAX_DRIFT_RAD)
+
+
+def test_hops_join_what_lies_metres_apart_on_one_drive() -> None:
+    way = np.concatenate([np.arange(0, 12, 0.75), np.arange(0, 12, 0.75)])
+    drive = np.repeat([0, 1], 16)
+    pairs = hop_pairs(frames_along(way, drive))
+    assert np.all(drive[pairs[:, 0]] == drive[pairs[:, 1]])
+    hops = way[pairs[:, 1]] - way[pairs[:, 0]]
+    assert np.all(np.min(np.abs(hops[:, None] - [2.0, 4.0, 8.0]), axis=1) < 0.76)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    assert len(hop_pairs(frames_along(np.arange(2.0), np.zeros(2, np.int64)))) == 0
+
+
+def test_loops_join_drives_that_are_near_and_a_drive_with_its_past() -> None:
+    """Out 30 m and back on the same line: neighbours in time are no loop, and each stretch gives its nearest."""
+    x = np.concatenate([np.arange(0, 30, 1.0), np.arange(30, 0, -1.0)])
+    frames = frames_along(np.arange(60.0), np.zeros(60, np.int64))
+    poses, everything = np.column_stack([x, np.zeros(60), np.zeros(60)]), np.arange(60)
+    pairs = loop_pairs(frames, poses, everything, everything, 2.5)
+    assert np.all(np.abs(np.diff(pairs, axis=1)) > LOOP_SPACING_M)
+    assert np.all(np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]) <= 2.5)
+    assert np.mean(x[pairs[:, 0]] == x[pairs[:, 1]]) > 0.9  # but where it turned, and the nearest is too near in time
+    assert {55, 5} <= set(pairs[:, 1].tolist())
+    both = frames_along(np.arange(60.0) % 30, np.repeat([0, 1], 30))
+    assert np.any(np.all(loop_pairs(both, poses, everything[30:], everything[:30], 2.5) == [29, 31], axis=1))
+    assert len(loop_pairs(frames, poses, everything, everything[:0], 2.5)) == 0
+
+
+def test_a_match_that_says_nothing_is_no_link() -> None:
+    sure = ScanMatch(np.zeros(3), np.diag([1e-4, 1e-4, 1e-6]), 0.9, 0.01, True)
+    assert worth_a_link(sure, 0.6)
+    assert worth_a_link(replace(sure, covariance=np.diag([1e4, 1e-4, 1e-6])), 0.6)  # across a smooth drift
+    assert not worth_a_link(replace(sure, covariance=np.diag([1e4, 1e4, 1e-6])), 0.6)
+    assert not worth_a_link(replace(sure, inliers=0.5), 0.6)
+    assert not worth_a_link(replace(sure, converged=False), 0.6)
