@@ -135,12 +135,14 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     assert sorted(placement.node_parts.tolist()) == [0] * 4 + [1] * (len(graph.nodes) - 4)
 
 
+@pytest.mark.parametrize(("other", "tag"), [(0, 0), (1, 1)])
 def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
-    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move
+    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, other: int, tag: int
 ) -> None:
     """No drive joins the two runs, only their scans at the one tag that both passed."""
-    graph, pieces = solve_runs([driven[0], replace(driven[1], passes=driven[1].passes[:1])])
-    assert driven[1].passes[0].epc in {found.epc for found in driven[0].passes}
+    epc = sorted({found.epc for found in driven[0].passes})[tag]
+    one = next(found for found in driven[other].passes if found.epc == epc)
+    graph, pieces = solve_runs([replace(of, passes=[one]) if k == other else of for k, of in enumerate(driven)])
     placement = place_by_frames(pieces, graph, match_scans)
     assert {piece.part for piece in placement.pieces} == {0}
     assert placement.remarks == []

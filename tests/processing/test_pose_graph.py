@@ -120,6 +120,15 @@ def test_a_consistent_graph_is_solved_exactly() -> None:
     assert_allclose(solution.weights, 1, atol=1e-6)
 
 
+def test_a_step_too_far_is_halved() -> None:
+    """From a guess this poor, the full steps of Gauss–Newton lead away."""
+    poses, links = network(4, noise=0.0)
+    trusted = Links(links.ends, links.motions, links.informations, np.zeros(len(links), bool))
+    guess = poses + np.random.default_rng(7).normal(0, [3.0, 3.0, 0.8], poses.shape)
+    guess[0] = poses[0]
+    assert_same(solve(guess, trusted).poses, poses, 1e-5)
+
+
 def test_the_solution_is_that_of_dense_least_squares() -> None:
     poses, links = network(5, noise=1.0)
     links = Links(links.ends, links.motions, links.informations, np.zeros(len(links), bool))
