@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from processing.edge_placement import Placed, Placement
-from processing.geometry import relative, wrap_angle
+from processing.geometry import compose, inverse, relative, wrap_angle
 from processing.graph import Graph
-from processing.length_placement import place_by_lengths
+from processing.length_placement import _find_hold, place_by_lengths
 from processing.pieces import SolvedPiece
 from processing.pipeline import DrivenRun
 from processing.scan_matching import match_scans
@@ -165,3 +165,16 @@ def test_a_run_without_tags_is_placed_alone(driven: list[DrivenRun], solve_runs:
     assert placement.nodes.shape == (0, 3)
     assert [piece.part for piece in placement.pieces] == [0]
     assert_allclose(placement.pieces[0].edge_poses[0], 0, atol=1e-12)
+
+
+def test_a_link_holds_a_spur_from_either_end(solved: Solved) -> None:
+    spur = next(piece for piece in solved[1] if piece.input.piece.j is None)
+    span = spur.input.piece.spans[0]
+    own, index = ((span.run, span.last), 1) if span.end is not None else ((span.run, span.first), 0)
+    known, there, motion = (7, 100), np.array([5.0, -3.0, 2.0]), np.array([0.8, 0.3, 1.0])
+    for link in ((known, own, motion), (own, known, inverse(motion))):
+        hold = _find_hold(spur, {known: (there, 2)}, [link])
+        assert hold is not None
+        assert_allclose(hold[0], compose(there, motion))
+        assert hold[1:] == (2, spur.ends(0)[index])
+    assert _find_hold(spur, {known: (there, 2)}, []) is None
