@@ -33,7 +33,13 @@ def assemble_atlas(
         "software": f"rtlog {version('rtlog')}",
         "parameters": asdict(config),
         "runs": [
-            {"id": d.run.run_id, "sha256": d.run.sha256, "ticks": d.run.ticks, "profile": d.run.profile.name}
+            {
+                "id": d.run.run_id,
+                "sha256": d.run.sha256,
+                "ticks": d.run.ticks,
+                "profile": d.run.profile.name,
+                "wheel_scale": _metres(d.wheels.scale),  # true over counted distance, as the laser saw it
+            }
             for d in runs
         ],
         "nodes": [_node(k, runs, graph, placement) for k in range(len(graph.nodes))],

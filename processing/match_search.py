@@ -15,6 +15,7 @@ from processing.scan_matching import Scan, match_scans
 Array = NDArray[np.float64]
 
 SEARCH_TURN_RAD = 0.15
+AS_GOOD = 0.02  # two scores this close tell nothing apart
 POOR_RESIDUAL_M = 0.025  # points this far off the walls they were drawn to say nothing; right matches leave half of it
 
 
@@ -23,20 +24,19 @@ def search_match(
 ) -> ScanMatch:
     """The best match from starts spread over a radius around the guess: for guesses too poor for `match_scans` alone.
 
-    Best is what `score` says.
+    Best is what `score` says; of matches that are as good, the one nearest to the guess: along a smooth drift all are.
     """
     shifts = np.arange(-np.ceil(radius_m / reach_m), np.ceil(radius_m / reach_m) + 1) * reach_m
     turns = np.linspace(-radius_rad, radius_rad, 2 * int(np.ceil(radius_rad / SEARCH_TURN_RAD)) + 1)
-    best: ScanMatch | None = None
-    for dx in shifts:
-        for dy in shifts:
-            if np.hypot(dx, dy) > radius_m + 1e-9:
-                continue
-            for turn in turns:
-                found = match_scans(reference, current, guess + np.array([dx, dy, turn]), reach_m)
-                if best is None or score(found) > score(best):
-                    best = found
-    assert best is not None  # the guess itself is always tried
+    dx, dy, turn = (axis.ravel() for axis in np.meshgrid(shifts, shifts, turns, indexing="ij"))
+    away = np.hypot(dx, dy)
+    order = np.lexsort((np.abs(turn), away))
+    starts = np.column_stack([dx, dy, turn])[order[away[order] <= radius_m + 1e-9]]
+    best = match_scans(reference, current, guess, reach_m)
+    for start in starts[1:]:  # the first is the guess itself
+        found = match_scans(reference, current, guess + start, reach_m)
+        if score(found) > score(best) + AS_GOOD:
+            best = found
     return best
 
 

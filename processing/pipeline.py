@@ -18,6 +18,7 @@ from hw_profiles.profile import Profile
 from processing.atlas import Atlas
 from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass, find_passes, overlapping_passes
+from processing.calibration import WheelScale, calibrate
 from processing.edge_placement import Placed, Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
 from processing.length_placement import place_by_lengths
@@ -59,6 +60,7 @@ class Config:
 @dataclass(frozen=True, slots=True)
 class DrivenRun:
     run: Run
+    wheels: WheelScale
     loop: OpenLoop
     passes: list[Pass]
 
@@ -83,13 +85,14 @@ def drive_through(recording: Path, profile: Profile | None, match: Matcher, conf
     run = read_log(recording, profile)
     if len(run.scans.times) < MIN_SCANS:
         raise BadInputError(f"{recording}: {len(run.scans.times)} scans are too few to map")
+    run, wheels = calibrate(run)
     driven = dead_reckon(odometry_at_scans(run))
     passes: list[Pass] = []
     if config.method == "landmark" and len(run.tags.epcs):
         nearest = np.searchsorted((run.scans.times[1:] + run.scans.times[:-1]) / 2, run.tags.times)
         passes = find_passes(run.tags.epcs, nearest, driven)
     loop = estimate_open_loop(run, np.array([found.centre for found in passes], np.int64), match)
-    return DrivenRun(run, loop, passes)
+    return DrivenRun(run, wheels, loop, passes)
 
 
 def piece_names(graph: Graph) -> list[str]:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
 MIN_INLIERS = 0.75
 MIN_WORTH = 0.1  # by agreement: one pair of different places in twenty has as much, nineteen of twenty passes more
+SEEN_M = 0.5  # standard deviation of a motion that the walls tell in every direction
 CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks the same both ways
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
 
@@ -96,11 +97,14 @@ def _places(
         for end_b in (0, -1)
         if ends[a][end_a] is not None and ends[a][end_a] == ends[b][end_b]
     ]
-    places = [
-        compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b]))
+    hypotheses = [
+        (found, compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b])))
         for end_a, end_b in shared
         for found in pass_hypotheses(scans[a][end_a], scans[b][end_b], mount)
     ]
+    # An end where the scans see the motion along the drift too says more than one between smooth walls.
+    hypotheses.sort(key=lambda of: bool(np.linalg.eigvalsh(of[0].covariance[:2, :2])[-1] > SEEN_M**2))
+    places = [start for _, start in hypotheses]
     # Where no scan tells, the tags coincide; of both headings, the one that brings the paths closer together.
     tree = cKDTree(poses[a][:, :2])
     blind = [

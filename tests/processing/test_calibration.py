@@ -1,0 +1,48 @@
+"""Calibration: the wheels' error is found where the walls show it, and left alone where they do not."""
+
+import numpy as np
+import pytest
+
+from processing.calibration import MAX_SIGMA, PRIOR, calibrate, estimate_scale, fit_scale, stride_pairs
+from processing.pipeline import DrivenRun
+
+
+def test_the_small_mine_shows_that_its_wheels_count_too_little(driven: list[DrivenRun]) -> None:
+    for of in driven:  # its world has wheels that are 1.0 and 0.8 % larger than the profile says
+        assert of.wheels.scale == pytest.approx(1.009, abs=0.002)
+        assert of.wheels.sigma < 0.001
+        assert estimate_scale(of.run).scale == pytest.approx(1.0, abs=0.001)  # put right, nothing is left to put right
+
+
+def test_perfect_wheels_stay_as_they_are(driven_clean: list[DrivenRun]) -> None:
+    for of in driven_clean:
+        assert of.wheels.scale == pytest.approx(1.0, abs=0.0005)
+
+
+def test_too_little_seen_changes_nothing(driven: list[DrivenRun], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("processing.calibration.MIN_INLIERS", 1.1)  # as if no match were good enough
+    run, wheels = calibrate(driven[0].run)
+    assert run is driven[0].run
+    assert (wheels.scale, wheels.pairs) == (1.0, 0)
+    assert wheels.sigma == pytest.approx(PRIOR)
+    assert wheels.sigma > MAX_SIGMA
+
+
+def test_fit_is_not_bent_by_matches_that_jumped() -> None:
+    rng = np.random.default_rng(5)
+    counted = rng.uniform(2, 4, 300)
+    variances = np.full(300, 0.01**2)
+    seen = 1.013 * counted + rng.normal(0, 0.01, 300)
+    seen[::5] += rng.choice([-0.4, 0.4, 0.8], 60)  # a fifth of them
+    fitted = fit_scale(counted, seen, variances)
+    assert fitted.scale == pytest.approx(1.013, abs=0.001)
+    assert 0.0001 < fitted.sigma < 0.0005
+
+
+def test_pairs_lie_their_stride_apart_all_along_the_way() -> None:
+    way = np.cumsum(np.random.default_rng(6).uniform(0, 0.4, 2000))
+    pairs = np.array(stride_pairs(way))
+    apart = way[pairs[:, 1]] - way[pairs[:, 0]]
+    assert np.all((apart >= 2.0) & (apart < 4.5))
+    assert np.ptp(way[pairs[:, 0]]) > 0.95 * np.ptp(way)
+    assert len(stride_pairs(np.zeros(50))) == 0  # a vehicle that stood still
