@@ -75,14 +75,6 @@ def relative_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
     return j_a, j_b
 
 
-def adjoint_covariance(pose: Array, covariance: Array) -> Array:
-    """Covariance (..., 3, 3) of a small motion given in the frame of `pose`, in the frame the pose is given in."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    turn = np.zeros((*c.shape, 3, 3))
-    turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1], turn[..., 2, 2] = c, -s, s, c, 1.0
-    return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2))
-
-
 def accumulate(start: Array, motions: Array) -> Array:
     """Poses (n + 1, 3) of a chain: `start` (3,), then each motion (n, 3) in the frame of the pose before it."""
     headings = np.concatenate([[start[2]], start[2] + np.cumsum(motions[:, 2])])

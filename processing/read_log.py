@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
-from hw_profiles.profile import Profile, parse_profile
+from hw_profiles.profile import ROLES, Profile, parse_profile
 from rtlog_client.log_file import LogInfo, read_info, read_messages
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import BY_NAME, JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
@@ -220,9 +220,8 @@ def _decoded(path: Path, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
 
 def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:
     """Reads both encoders of a JointState in the order of their roles; None where one is missing."""
-    roles = {"differential": ("left_wheel", "right_wheel"), "tricycle": ("drive_wheel", "steering")}
     assert profile.vehicle is not None  # a profile with encoders was checked to have one
-    first, second = (profile.encoder(role).name for role in roles[profile.vehicle.kinematics])
+    first, second = (profile.encoder(role).name for role in ROLES[profile.vehicle.kinematics])
 
     def read(message: Any) -> tuple[float, float] | None:
         names = list(message.name)
