@@ -111,7 +111,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         chain
         + _wheels(paths, firsts)
         + _joins(paths, firsts)
-        + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS)
+        + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS, between_drives=False)
     )
     loops = NO_LINKS
     present = np.zeros(len(poses), bool)
@@ -162,7 +162,7 @@ def _close(
             if len(found):
                 tried = _solve_present(poses, links + found, present, GRADUAL)
         pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
-        closed = match_pairs(frames, tried, pairs, LOOP_INLIERS)
+        closed = match_pairs(frames, tried, pairs, LOOP_INLIERS, between_drives=True)
         if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
             return found + closed, tried, False
     return NO_LINKS, poses, True
@@ -177,7 +177,7 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
     for _ in range(MAX_ROUNDS):
         pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-        loops = match_pairs(frames, poses, pairs, LOOP_INLIERS)
+        loops = match_pairs(frames, poses, pairs, LOOP_INLIERS, between_drives=True)
         solution = solve(poses, links + loops)
         poses = solution.poses
         kept = {(int(i), int(j)) for i, j in loops.ends}

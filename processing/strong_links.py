@@ -28,6 +28,8 @@ HOP_INLIERS = 0.6
 LOOP_RADIUS_M = 2.5  # Δr_max
 LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
 LOOP_INLIERS = 0.6
+UNSEEN_M = 1.0  # a motion known no better than this was not seen
+TILT_M, TILT_RAD = 0.02, 0.02
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
 
 
@@ -74,6 +76,17 @@ def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: 
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
+def blur(covariance: Array) -> Array:
+    """The covariance (3, 3) of a match, and where it does not see the way along a drift, doubt about which way that is.
+
+    The direction that a match leaves open comes from noisy walls, and is off by milliradians. Over the metres that two
+    drives may be off along a smooth drift, that pretends to see them, and many such links would add up to a lie.
+    """
+    if np.linalg.eigvalsh(covariance[:2, :2])[-1] < UNSEEN_M**2:
+        return covariance
+    return covariance + np.diag([TILT_M**2, TILT_M**2, TILT_RAD**2])
+
+
 def nearest(poses: Array, candidates: Ints, i: int) -> int:
     return int(candidates[np.argmin(np.hypot(*(poses[candidates, :2] - poses[i, :2]).T))])
 
@@ -97,7 +110,7 @@ def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
     return bool(found.converged and found.inliers >= min_inliers and seen)
 
 
-def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float) -> Links:
+def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float, between_drives: bool) -> Links:
     """The links that come of the pairs (p, 2): those whose scans match well and say something."""
     ends, motions, informations = [], [], []
     for i, j in pairs:
@@ -108,5 +121,5 @@ def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float
             continue
         ends.append((i, j))
         motions.append(found.motion)
-        informations.append(np.linalg.inv(found.covariance))
+        informations.append(np.linalg.inv(blur(found.covariance) if between_drives else found.covariance))
     return Links.of(np.array(ends, np.int64), np.array(motions), np.array(informations), robust=True)
