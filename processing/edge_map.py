@@ -172,8 +172,6 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
     """Search all loops anew from the solved poses, until the set of links no longer changes."""
     everything = np.arange(len(poses))
     known: set[tuple[int, int]] = set()
-    solution = solve(poses, links)
-    loops = links[np.empty(0, np.int64)]
     for _ in range(MAX_ROUNDS):
         pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
@@ -184,7 +182,7 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
         if len(kept ^ known) <= 0.02 * len(kept):
             break
         known = kept
-    believed = (links + loops)[np.flatnonzero(np.asarray(solution.weights) >= DOUBTED)]
+    believed = (links + loops)[np.flatnonzero(solution.weights >= DOUBTED)]
     solution = solve(poses, believed)
     return PieceMap(solution.poses, firsts, believed, solution)
 

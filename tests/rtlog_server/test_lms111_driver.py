@@ -183,8 +183,8 @@ def test_a_scanner_that_takes_its_time_is_waited_for(open_drive: Open, feed: Fee
 
 
 def test_the_scanner_comes_after_the_driver(open_drive: Open, feed: Feed) -> None:
-    with Lms111Emulator() as placeholder:
-        address = placeholder.address
+    with Lms111Emulator() as gone:
+        address = gone.address
     drive = open_drive(address)
     drive.wait_message("refused")
     assert f"LMS111 at 127.0.0.1:{address[1]}" in drive.driver.message
