@@ -1,13 +1,21 @@
 # `make demo` and `make test` set themselves up on a bare machine.
 PY := .venv/bin/python
 
-.PHONY: demo test lint lock
+.PHONY: demo test lint bench hil lock
 
 demo: .venv/ready
 	$(PY) tests/system/demo.py
 
 test: .venv/ready
 	$(PY) -m pytest
+
+# Ratios against other programs and against targets, measured side by side.
+bench: .venv/bench
+	for benchmark in tests/benchmarks/bench_*.py; do $(PY) $$benchmark || exit 1; done
+
+# The long tests at the wire: replays through the emulators with faults, fuzzing, a soak.
+hil: .venv/bench
+	$(PY) -m pytest tests/hil
 
 lint: .venv/ready
 	.venv/bin/ruff check .
@@ -25,6 +33,11 @@ lint: .venv/ready
 	$(PY) -m pip install --quiet --no-deps -e .
 	touch $@
 
+.venv/bench: .venv/ready bench.lock
+	$(PY) -m pip install --quiet --require-hashes -r bench.lock
+	touch $@
+
 # Resolve pyproject.toml anew for every Python from 3.11 on.
 lock:
 	uv pip compile --universal --python-version 3.11 --extra dev --generate-hashes -q pyproject.toml -o requirements.lock
+	uv pip compile --universal --python-version 3.11 --extra bench -c requirements.lock --generate-hashes -q pyproject.toml -o bench.lock
