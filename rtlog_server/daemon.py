@@ -7,6 +7,7 @@ The law: neither a device nor the network can delay a tick. A device that is awa
 does not keep up costs counted ticks, and one that died ends the server (systemd starts it anew).
 """
 
+import faulthandler
 import gc
 import logging
 import multiprocessing
@@ -24,7 +25,7 @@ from hw_profiles.profile import Profile
 from rtlog_server.bundle import Bundle, Report, ServerInfo
 from rtlog_server.devices import open_devices
 from rtlog_server.devices.device import Device
-from rtlog_server.health import ReportTimer, notify, status_line
+from rtlog_server.health import ReportTimer, notify, ready_message, status_line
 from rtlog_server.outbox import Outbox
 from rtlog_server.realtime import become_realtime, freeze_garbage
 from rtlog_server.sampler import Sampler
@@ -47,6 +48,7 @@ def run(profile: Profile, profile_toml: str) -> None:
         RTLogError: the publishing process failed: one line that says why.
     """
     devices = open_devices(profile)
+    faulthandler.enable()  # systemd's watchdog sends SIGABRT: the journal then tells where every thread stood
     stop_requests: list[int] = []
     for number in END_SIGNALS:
         signal.signal(number, lambda number, _: stop_requests.append(number))
@@ -86,7 +88,9 @@ def sample_for_ever(
         device.start(grid)
     freeze_garbage()
     for tick in ticks(grid, stopped):
-        publisher.check()
+        if publisher.came_up():
+            log.info("publishing")
+            notify(ready_message(period_s))
         samples, device_reports = sampler.sample(tick)
         lateness.add(tick)
         report = None
@@ -125,10 +129,14 @@ class PublishingProcess:
         theirs.close()
         self.outbox = Outbox(self._connection, QUEUE_TICKS)
 
-    def check(self) -> None:
-        """Hear what the process has to say. Raises: RTLogError: it failed, or it is gone."""
+    def came_up(self) -> bool:
+        """Hear what the process has to say: True once, when it has begun to publish.
+
+        Raises:
+            RTLogError: it failed, or it is gone.
+        """
         if not self._connection.poll():
-            return
+            return False
         try:
             failure = self._connection.recv()
         except (EOFError, ConnectionResetError):
@@ -136,8 +144,7 @@ class PublishingProcess:
             failure = f"the publishing process ended (exit status {self._process.exitcode})"
         if failure:
             raise RTLogError(failure)
-        log.info("publishing")
-        notify("READY=1")
+        return True
 
     def close(self) -> None:
         """Let everything that was queued go out. Raises: RTLogError: it would not."""

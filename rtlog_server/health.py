@@ -20,6 +20,7 @@ from rtlog_server.topics import TICK
 log = logging.getLogger(__name__)
 
 REPORT_NS = 1_000_000_000
+WATCHDOG_REPORTS = 3  # that the watchdog waits for one
 STATE_NAMES = {OK: "OK", STALE: "STALE", MISSING: "MISSING"}
 LEVELS = {OK: DiagnosticStatus.OK, STALE: DiagnosticStatus.WARN, MISSING: DiagnosticStatus.ERROR}
 
@@ -120,8 +121,22 @@ def _device_answer(device: DeviceReport) -> dict[str, Any]:
 
 def status_line(report: Report) -> str:
     """One line for `systemctl status`."""
+    late = report.lateness
     states = ", ".join(f"{device.name} {STATE_NAMES[device.state]}" for device in report.devices)
-    return f"{report.lateness.count} ticks, {report.dropped_ticks} dropped; {states}"
+    return (
+        f"{late.count} ticks, {report.dropped_ticks} dropped, {late.overruns} overruns; "
+        f"late by {late.p99_s * 1e3:.2f} ms (p99), {late.max_s * 1e3:.2f} ms (worst); {states}"
+    )
+
+
+def ready_message(tick_period_s: float) -> str:
+    """What to `notify` when the start is done; it asks for a longer watchdog if the unit's is too short for the ticks.
+
+    The tick loop feeds the watchdog with each report: once a second, or at every tick where these are further apart.
+    """
+    wanted_us = round(max(1.0, tick_period_s) * WATCHDOG_REPORTS * 1e6)
+    granted_us = int(os.environ.get("WATCHDOG_USEC", "0"))
+    return f"READY=1\nWATCHDOG_USEC={wanted_us}" if 0 < granted_us < wanted_us else "READY=1"
 
 
 def notify(message: str) -> None:
