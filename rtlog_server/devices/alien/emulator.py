@@ -12,7 +12,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rtlog_server.devices.alien import protocol
 from rtlog_server.devices.alien.emulated_reader import EmulatedReader
@@ -26,6 +26,9 @@ BACKLOG_LINES = 10_000  # kept while the stream is not open
 class Alr9650Emulator:
     """The reader, powered from construction to `close()`; a context manager.
 
+    Args:
+        connect: how it calls its client back for the tag stream: address, time limit in s → socket.
+
     Attributes:
         port: where the console is.
         busy: fault: another client holds the console.
@@ -34,10 +37,16 @@ class Alr9650Emulator:
     """
 
     def __init__(
-        self, host: str = "127.0.0.1", port: int = 0, username: str = "alien", password: str = "password"
+        self,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        username: str = "alien",
+        password: str = "password",
+        connect: Callable[[tuple[str, int], float], socket.socket] = socket.create_connection,
     ) -> None:
         self._host = host
         self._login = username, password
+        self._connect = connect
         self._reader = EmulatedReader()
         self._changed = threading.Condition()  # guards reader and lines, tells the push thread
         self._lines: deque[str] = deque(maxlen=BACKLOG_LINES)
@@ -208,7 +217,7 @@ class Alr9650Emulator:
 
     def _open_stream(self, address: tuple[str, int]) -> socket.socket | None:
         try:
-            stream = socket.create_connection(address, timeout=1.0)
+            stream = self._connect(address, 1.0)
         except OSError:
             return None
         if self._reader.settings["StreamHeader"].upper() == "ON":
