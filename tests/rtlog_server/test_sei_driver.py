@@ -99,7 +99,7 @@ def test_positions_at_their_stamps_are_the_true_ones_over_many_turns(
     assert abs(statistics.median(errors_s[0::2]) + statistics.median(errors_s[1::2])) / 2 < 0.0012  # no bias
     assert abs(bus.readings[-1].counts[0] - first.counts[0]) > 1.5 * COUNTS
     assert bus.device.diagnostics["echo"] == ("yes" if echo else "no")
-    assert bus.device.identity["right_wheel"].endswith("address 5, serial number 61005")
+    assert bus.device.identity["right_wheel"].endswith(f"address 5, serial number 61005, {turns}-turn, ok")
 
 
 def test_each_tick_has_a_reading_taken_just_before_it(link: Path, running: list[SeiEncoders]) -> None:

@@ -9,7 +9,6 @@ A reader that cannot reach us (firewall, wrong `stream_host`) never opens its st
 the console until it does. What both tell of a tag counts once.
 """
 
-import contextlib
 import selectors
 import socket
 import time
@@ -18,6 +17,7 @@ from collections import Counter
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices.alien import protocol
 from rtlog_server.devices.alien.console import REPLY_S, Console
+from rtlog_server.devices.alien.identity import read_identity
 from rtlog_server.devices.alien.protocol import TAG_FORMAT, AlienError, TagRead
 from rtlog_server.devices.device import Device, DeviceError
 from rtlog_server.devices.rfid import TagSample
@@ -43,7 +43,6 @@ SETTINGS = (
     ("TagStreamCountFilter", "0"),
     ("TagStreamKeepAliveTime", "1800"),  # s that an idle stream stays open
 )
-IDENTITY = ("ReaderName", "ReaderType", "ReaderVersion", "MACAddress")
 
 
 class Alr9650(Device[TagSample]):
@@ -71,10 +70,10 @@ class Alr9650(Device[TagSample]):
         self._listener = listener = self._listen(console.socket)
         host = self._settings.stream_host or console.socket.getsockname()[0]
         self._stream_address = f"{host}:{listener.getsockname()[1]}"
-        self.identity = {}
-        for name in IDENTITY:
-            with contextlib.suppress(AlienError):  # it has no such setting
-                self.identity[name] = protocol.parse_setting(console.ask(f"get {name}"))[1]
+        identity = read_identity(console, time.time_ns())
+        told = {"ReaderName": identity.name, "ReaderType": identity.reader_type, "ReaderVersion": identity.firmware}
+        told["MACAddress"] = identity.mac_address
+        self.identity = {name: text for name, text in told.items() if text}
         self._configure(console)
         self._selector = selectors.DefaultSelector()
         self._selector.register(console.socket, selectors.EVENT_READ)

@@ -19,9 +19,12 @@ SETTINGS: dict[str, tuple[str, str | None]] = {
     "ReaderName": ("Alien RFID Reader", ANY),
     "ReaderType": ("Alien RFID Tag Reader, Model: ALR-9650 (One Antenna / Gen 2 / 902-928 MHz)", None),
     "ReaderVersion": ("14.07.01.00", None),
+    "ReaderNumber": ("255", NUMBER),
+    "MACAddress": ("00:1B:5F:00:00:00", None),
     "MaxAntenna": ("1", None),
     "AntennaSequence": ("0", r"\d+(\s*,\s*\d+)*"),
     "RFAttenuation": ("0", NUMBER),
+    "RFLevel": ("290", NUMBER),
     "NetworkTimeout": ("90", NUMBER),
     "AcquireMode": ("Inventory", r"Inventory|Global Scroll"),
     "PersistTime": ("-1", NUMBER),
@@ -95,6 +98,10 @@ class EmulatedReader:
             case ["save"]:
                 self.saved = dict(self.settings)
                 return "All settings have been saved!"
+            case ["get", "time"]:
+                return f"Time = {protocol.format_date(now_ms)}"
+            case ["get", "uptime"]:
+                return f"Uptime (secs) = {now_ms // 1000}"
             case ["t", *_] | ["get", "taglist", *_]:
                 return self._tag_list(now_ms)
         if found := re.fullmatch(r"(?:set )?(\w+) ?= ?(.*)", command, re.IGNORECASE):

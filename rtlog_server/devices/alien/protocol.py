@@ -173,11 +173,11 @@ def parse_tag(line: str) -> TagRead | None:
 
 def _parse_text(line: str) -> TagRead:
     fields = dict(part.strip().split(":", 1) for part in line.split(","))
-    seen = [_parse_date_ms(fields[key]) if key in fields else None for key in ("Disc", "Last")]
+    seen = [parse_date_ms(fields[key]) if key in fields else None for key in ("Disc", "Last")]
     return _tag(fields["Tag"], fields.get("Ant", "0"), fields.get("Count", "1"), math.nan, seen[0], seen[1])
 
 
-def _parse_date_ms(text: str) -> int:
+def parse_date_ms(text: str) -> int:
     """Unix ms of `2003/01/21 09:00:51`, fractions and years of two digits allowed."""
     match = re.fullmatch(r"\s*(\d{2}|\d{4})/(\d\d)/(\d\d) (\d\d):(\d\d):(\d\d)(?:\.(\d{1,3}))?\s*", text, re.ASCII)
     if match is None:

@@ -21,6 +21,7 @@ from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.device import Device, DeviceError, TickGrid
 from rtlog_server.devices.encoders import EncoderReading, TurnCounter, position_rad
 from rtlog_server.devices.sei import protocol
+from rtlog_server.devices.sei.identity import identify_encoder
 from rtlog_server.devices.sei.port import SeiPort
 
 MARGIN_NS = 4_000_000  # from the last reply to the tick
@@ -79,18 +80,9 @@ class SeiEncoders(Device[EncoderReading]):
 
     def connect(self) -> None:
         self._port = SeiPort(self._bus)
-        if self._bus.baud != protocol.POWER_UP_BAUD:
-            self._port.raise_baud()
-        try:
-            self._port.learn_echo(list(self._addresses.values()), self._reply_bytes)
-        except DeviceError:
-            if self._bus.baud == protocol.POWER_UP_BAUD:
-                self._port.reset_fast_encoders()
-            raise
-        if self._bus.echo != "auto" and self._port.echo != (self._bus.echo == "yes"):
-            raise DeviceError(f"{self._bus.port}: encoder_bus.echo is {self._bus.echo!r}, but the adapter differs")
+        self._port.settle(self._encoders)
         self._silent, self._silent_rounds = {}, 0
-        self.identity = {name: self._identify(self._port, address) for name, address in self._addresses.items()}
+        self.identity = {encoder.name: str(identify_encoder(self._port, encoder)) for encoder in self._encoders}
 
     def read(self) -> None:
         assert self.grid is not None  # set by start()
@@ -190,11 +182,3 @@ class SeiEncoders(Device[EncoderReading]):
             "round_ms": f"{self._round_ns * 1e-6:.1f}",
             "echo": "yes" if port.echo else "no",
         }
-
-    def _identify(self, port: SeiPort, address: int) -> str:
-        request = protocol.serial_number_request(address)
-        try:
-            reply = port.exchange(request, protocol.SERIAL_REPLY_BYTES).reply
-            return f"US Digital A2, address {address:X}, serial number {protocol.decode_serial_number(reply)}"
-        except protocol.SeiError:
-            return f"address {address:X}, serial number not told"

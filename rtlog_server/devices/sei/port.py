@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import serial
 
-from hw_profiles.profile import SeiBus
+from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.device import DeviceError
 from rtlog_server.devices.sei import protocol
 
@@ -65,6 +65,25 @@ class SeiPort:
         sent_ns, received = self._send_and_read(request, reply_bytes + len(request) * self._echo)
         complete_ns = time.monotonic_ns()
         return Exchange(protocol.strip_echo(received, request, self._echo), sent_ns, complete_ns)
+
+    def settle(self, encoders: Sequence[Encoder]) -> None:
+        """Bring the encoders to the profile's baud rate and find out whether the adapter echoes.
+
+        Raises:
+            DeviceError: no encoder answers, or otherwise than the profile says.
+        """
+        if self._bus.baud != protocol.POWER_UP_BAUD:
+            self.raise_baud()
+        try:
+            # A profile with a bus was checked to hold every address.
+            reply_bytes = protocol.position_reply_bytes(self._bus.turns == "multi")
+            self.learn_echo([encoder.address or 0 for encoder in encoders], reply_bytes)
+        except DeviceError:
+            if self._bus.baud == protocol.POWER_UP_BAUD:
+                self.reset_fast_encoders()
+            raise
+        if self._bus.echo != "auto" and self._echo != (self._bus.echo == "yes"):
+            raise DeviceError(f"{self._bus.port}: encoder_bus.echo is {self._bus.echo!r}, but the adapter differs")
 
     def learn_echo(self, addresses: Sequence[int], reply_bytes: int) -> None:
         """Find out by position requests whether the adapter echoes; two in succession must agree.
