@@ -53,6 +53,8 @@ class LaserDevice(Record, frozen=True):
     host: str
     port: int = 2112
     scan_frequency_hz: Literal[25, 50] = 50  # the LMS111 pairs 25 Hz with 0.25° and 50 Hz with 0.5°
+    echo: Literal["first", "last"] = "first"  # of a ray that met two things: "last" sees through dust, rain and mesh
+    remission_bits: Literal[8, 16] = 16
 
 
 class Laser(Record, frozen=True):

@@ -83,15 +83,15 @@ def test_nothing_is_changed_without_a_login(dialect: Dialect, connect: Connect) 
 def test_measuring_stops_for_a_new_frequency_and_starts_on_command(emulator: Lms111Emulator, connect: Connect) -> None:
     client = connect(emulator)
     client.ask("sMN SetAccessMode", *AUTHORISED_CLIENT)
-    assert client.ask("sRN STlms") == ("sRA STlms", (7,))
+    assert client.ask("sRN STlms") == ("sRA STlms", (7, 0))
     assert client.ask("sMN mLMPsetscancfg", 5000, 1, 2500, -450000, 2250000)[1][0] == 3  # no such pair
-    assert client.ask("sRN STlms") == ("sRA STlms", (7,))
+    assert client.ask("sRN STlms") == ("sRA STlms", (7, 0))
     assert client.ask("sMN mLMPsetscancfg", 5000, 1, 5000, -450000, 2250000)[1][0] == 0
-    assert client.ask("sRN STlms") == ("sRA STlms", (3,))
+    assert client.ask("sRN STlms") == ("sRA STlms", (3, 0))
     assert client.ask("sMN LMCstartmeas") == ("sAN LMCstartmeas", (0,))
-    assert client.ask("sRN STlms") == ("sRA STlms", (7,))
+    assert client.ask("sRN STlms") == ("sRA STlms", (7, 0))
     assert client.ask("sMN LMCstopmeas") == ("sAN LMCstopmeas", (0,))
-    assert client.ask("sRN STlms") == ("sRA STlms", (3,))
+    assert client.ask("sRN STlms") == ("sRA STlms", (3, 0))
 
 
 def test_what_it_does_not_know_is_an_error(emulator: Lms111Emulator, connect: Connect) -> None:
@@ -177,7 +177,7 @@ def test_the_dialect_changes_with_the_next_connection(emulator: Lms111Emulator, 
     assert client.ask("sWN EIHstCola", 0) == ("sWA EIHstCola", ())
     assert client.ask("sRN EIHstCola") == ("sRA EIHstCola", (0,))
     client.socket.close()
-    assert connect(emulator, Dialect.A).ask("sRN STlms") == ("sRA STlms", (7,))
+    assert connect(emulator, Dialect.A).ask("sRN STlms") == ("sRA STlms", (7, 0))
 
 
 def test_quantised_ranges() -> None:
@@ -221,4 +221,4 @@ def test_no_bytes_from_a_client_disturb_it(emulator: Lms111Emulator, connect: Co
         payload = noise.choice(commands) + noise.randbytes(noise.randrange(1, 20))
         client.socket.sendall(frame(Dialect.B, payload) if noise.random() < 0.7 else payload)
     client.socket.close()
-    assert connect(emulator).ask("sRN STlms") == ("sRA STlms", (7,))
+    assert connect(emulator).ask("sRN STlms") == ("sRA STlms", (7, 0))

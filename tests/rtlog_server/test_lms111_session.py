@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rtlog_server.devices.laser import Scan
 from rtlog_server.devices.lms111.cola import Dialect, Receiver, frame
 from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.protocol import Command, decode, encode_command, reply_name
+from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
 
 CAPTURES = Path(__file__).parents[3] / "shared" / "data" / "lms111"
 needs_captures = pytest.mark.skipif(not CAPTURES.is_dir(), reason=f"no captured sessions in {CAPTURES}")
@@ -164,24 +166,58 @@ def test_events_between_command_and_reply(open_peer: OpenPeer) -> None:
 
 @needs_captures
 @pytest.mark.parametrize(
-    ("sent", "repeated", "lost"),
-    [((0, 1, 2), 0, 0), ((0, 0, 1), 1, 0), ((0, 4), 0, 3), ((4, 0, 1), 0, 0)],  # the last: it counts anew
+    ("sent", "arrived", "repeated", "lost"),
+    [
+        ((0, 1, 2), (0, 1, 2), 0, 0),
+        ((0, 0, 1), (0, 1), 1, 0),
+        ((0, 1, 2, 1, 2, 3), (0, 1, 2, 3), 2, 0),
+        ((0, 4), (0, 4), 0, 3),
+    ],
 )
 def test_scans_in_one_piece_with_the_registration(
-    sent: tuple[int, ...], repeated: int, lost: int, open_peer: OpenPeer
+    sent: tuple[int, ...], arrived: tuple[int, ...], repeated: int, lost: int, open_peer: OpenPeer
 ) -> None:
     replies = telegrams(REPLIES)
     _, driver = open_peer(replies | {"sEN LMDscandata": replies["sEN LMDscandata"] + scan_telegrams(*sent)})
+    assert wait_counters(driver, len(arrived)) == [63336 + k for k in arrived]
+    wait_until(lambda: driver.diagnostics["scans repeated"] == str(repeated))
+    assert driver.diagnostics["scans lost"] == str(lost)
+
+
+def wait_counters(driver: Lms111, count: int) -> list[int]:
+    """The telegram counters of the first scans."""
     counters: list[int] = []
     wait_until(
         lambda: (
             counters.extend(scan.telegram_counter for scan in driver.collect(time.monotonic_ns()).samples)
-            or len(counters) == len(sent) - repeated
+            or len(counters) >= count
         )
     )
-    assert counters == [63336 + k for k in dict.fromkeys(sent)]
-    wait_until(lambda: driver.diagnostics["scans repeated"] == str(repeated))
+    return counters
+
+
+@needs_captures
+@pytest.mark.parametrize(
+    ("counters", "lost", "skipped"),
+    [
+        (((65534, 65533), (65535, 65534), (0, 65535), (1, 0), (2, 1)), 0, 0),  # both wrap
+        (((65534, 10), (1, 13)), 2, 0),  # lost on the way, across the wrap
+        (((5, 10), (6, 13), (7, 14)), 0, 2),  # the device made two that it did not send
+        (((40_000, 40_000), (1, 1), (2, 2)), 0, 0),  # it counts anew
+    ],
+)
+def test_counters(counters: tuple[tuple[int, int], ...], lost: int, skipped: int, open_peer: OpenPeer) -> None:
+    (scan,) = (decode(Dialect.B, payload) for payload in Receiver(Dialect.B).feed(scan_telegrams(0)))
+    assert isinstance(scan, ScanData)
+    replies = telegrams(REPLIES)
+    for sent, made in counters:
+        counted = replace(scan, telegram_counter=sent, scan_counter=made)
+        replies["sEN LMDscandata"] += encode_scan_data(Dialect.B, counted)
+    _, driver = open_peer(replies)
+    assert wait_counters(driver, len(counters)) == [sent for sent, _ in counters]
+    wait_until(lambda: driver.diagnostics["scans"] == str(len(counters)))
     assert driver.diagnostics["scans lost"] == str(lost)
+    assert driver.diagnostics["scans skipped by the device"] == str(skipped)
 
 
 def test_only_what_differs_is_written(open_peer: OpenPeer) -> None:

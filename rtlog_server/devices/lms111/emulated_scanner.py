@@ -17,6 +17,7 @@ from rtlog_server.clock import WRAP_US
 from rtlog_server.devices.lms111.protocol import (
     ACCESS_DENIED,
     AUTHORISED_CLIENT,
+    DEVICE_ERROR,
     IDLE,
     IN_PREPARATION,
     INITIALISING,
@@ -55,8 +56,8 @@ FIXED: dict[str, tuple[Any, ...]] = {
     "LocationName": ("not defined",),
     "ODoprh": (1110,),
     "ODpwrc": (63,),
-    "LCMstate": (0,),
 }
+CONTAMINATION_OF_STATUS = {2: 1, 4: 2, 5: 2}  # LCMstate by the device status of the scans
 WRITABLE = ("LMPoutputRange", "LMDscandatacfg", "EIHstCola")
 DONE = {"LMCstandby": 0, "mEEwriteall": 1, "LSPsetdatetime": 1}  # methods that only say that all went well
 
@@ -116,6 +117,7 @@ class EmulatedScanner:
         self._start_ns = int(start_s * 1e9)
         self._kept = {"EIHstCola": (int(speaks_cola_b),)}
         self.device_status = (0, 0)
+        self.outside_temperature = False
         self.power_up(now_ns)
 
     def power_up(self, now_ns: int) -> None:
@@ -169,8 +171,12 @@ class EmulatedScanner:
         if name == "STlms":
             calendar = time.gmtime((now_ns - self._power_up_ns) // 1_000_000_000)
             texts = time.strftime("%H:%M:%S", calendar), time.strftime("%d.%m.%Y", calendar)
-            return (self.state(now_ns), 0, *texts, 0, 0, 0)
+            return (self.state(now_ns), int(self.outside_temperature), *texts, 0, 0, 0)
+        if name == "LCMstate":
+            return (CONTAMINATION_OF_STATUS.get(self.device_status[1], 0),)
         if name == "SCdevicestate":
+            if self.device_status[1] == 1:
+                return (DEVICE_ERROR,)
             return (int(not self._logged_in and self.state(now_ns) == MEASURING),)
         return self._variables.get(name)
 

@@ -133,6 +133,10 @@ class Lms111Emulator:
         """The device status of the scans from now on: 1 error, 2 contamination warning, 4 contamination error."""
         self._call(setattr, self._scanner, "device_status", (0, status))
 
+    def set_temperature(self, outside: bool) -> None:
+        """Whether it is outside of its temperature range."""
+        self._call(setattr, self._scanner, "outside_temperature", outside)
+
     def drop_connection(self) -> None:
         """Reset the client's connection."""
         self._call(self._hang_up, True)

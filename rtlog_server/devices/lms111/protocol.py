@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtlog_server.devices.lms111.cola import Dialect, frame, split_command
-from rtlog_server.devices.lms111.fields import open_reader, open_writer
+from rtlog_server.devices.lms111.fields import Reader, open_reader, open_writer
 from rtlog_server.devices.lms111.scan_data import ScanData, read_scan_data
 
 AUTHORISED_CLIENT = (3, 0xF4724744)  # level, and the hash of its factory password
@@ -95,8 +95,26 @@ ERRORS = {  # of sFA
     15: "unknown event",
     16: "value too large",
     17: "invalid character",
+    18: "no internal message",
+    19: "no internal answer",
+    20: "internal error",
+    21: "hub address too short or too long",
+    22: "hub address cannot be decoded",
+    23: "too many hubs in the address",
+    24: "blank expected in the hub address",
+    25: "asynchronous methods are suppressed",
+    32: "complex arrays not supported",
+    33: "no resources for a session",
+    34: "unknown session",
+    35: "cannot connect",
+    36: "invalid port",
+    37: "scan already active",
+    38: "out of timers",
     39: "write mode not enabled",
 }
+
+DEVICE_BUSY, DEVICE_READY, DEVICE_ERROR = 0, 1, 2  # SCdevicestate; busy also while somebody is logged in
+CONTAMINATION = {0: "", 1: "front window is dirty", 2: "front window is too dirty", 3: "front window is very dirty"}
 
 REPLY_VERBS = {"sRN": "sRA", "sWN": "sWA", "sMN": "sAN", "sEN": "sEA"}
 
@@ -141,8 +159,20 @@ def decode(dialect: Dialect, payload: bytes) -> Command | ScanData:
     if name in ("sSN LMDscandata", "sRA LMDscandata"):
         return read_scan_data(reader)
     if name == "sRA STlms":
-        (state,) = reader.take("B")
-        # Manuals disagree on whether the state has 8 or 16 bits in CoLa B; no state needs the upper byte.
-        return Command(name, (state or reader.take("B")[0],))
+        return Command(name, _read_state(reader))
     layout = LAYOUTS.get(name, "")
     return Command(name, tuple(reader.text() if code == "s" else reader.take(code)[0] for code in layout))
+
+
+def _read_state(reader: Reader) -> tuple[int, int]:
+    """State, and 1 outside of the temperature range; what follows, a calendar and LEDs, is of no use.
+
+    Manuals disagree on whether the two have 8 or 16 bits in CoLa B. No state needs the upper byte, and behind two
+    numbers of 8 bits there follows a length, which is more than 1.
+    """
+    state, outside = reader.take("BB")
+    if state == 0:
+        (third,) = reader.take("H")
+        if third <= 1:
+            return outside, third
+    return state, outside

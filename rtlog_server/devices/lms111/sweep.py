@@ -40,6 +40,9 @@ LOWEST_DISTANCE = 16  # smaller ones are codes: dazzled, rejected by a filter, r
 RANGE_MIN_M = 0.016
 RANGE_MAX_M = 20.0
 
+LOWEST_CENTIHZ, HIGHEST_CENTIHZ = 500, 10_000  # 5 to 100 Hz, of any scanner with this protocol
+MAX_AGE_US = 5_000_000  # of a sweep that is transmitted; on a connection that stalls the device buffers
+
 MAX_MOTOR_ERROR = 0.02  # of the nominal period; the captured motor ran 0.57 % slow
 
 STATUS = {
@@ -65,10 +68,10 @@ def period_us(scan: ScanData, before: ScanData | None) -> float:
     """One turn of the head: as timed since the sweep before, if that was its neighbour, else the nominal.
 
     Raises:
-        ColaError: the scan tells no frequency.
+        ColaError: no scanner turns as the scan tells.
     """
-    if scan.scan_frequency_centihz == 0:
-        raise ColaError("scan frequency is 0")
+    if not LOWEST_CENTIHZ <= scan.scan_frequency_centihz <= HIGHEST_CENTIHZ:
+        raise ColaError(f"scan frequency is {scan.scan_frequency_centihz / 100:g} Hz")
     nominal_us = 1e8 / scan.scan_frequency_centihz
     if before is not None and (scan.scan_counter - before.scan_counter) % 65536 == 1:
         timed_us = (scan.time_since_startup_us - before.time_since_startup_us) % WRAP_US
@@ -81,38 +84,64 @@ def ranges_m(distances: Channel) -> NDArray[np.float32]:
     """(N,) ranges, REP-117: +inf where no echo came back, NaN for the codes of rays that the device rejects."""
     millimetres = distances.data * distances.scale_factor + distances.scale_offset
     ranges = (millimetres * 1e-3).astype(np.float32)
-    ranges[distances.data < LOWEST_DISTANCE] = np.nan
+    ranges[(distances.data < LOWEST_DISTANCE) | (ranges <= 0)] = np.nan
     ranges[distances.data == NO_ECHO] = np.inf
     return ranges
 
 
-def to_scan(scan: ScanData, transmitted_ns: int, period_us: float) -> Scan:
+def echoes(scan: ScanData, echo: str) -> tuple[Channel, NDArray[np.float32], NDArray[np.float32]]:
+    """The distances' channel, (N,) ranges and (N,) or (0,) remissions of the first or the last echo.
+
+    The last echo is the second where a ray has two, else the first. Raises: ColaError: the scan holds no distances.
+    """
+    first = scan.channel("DIST1")
+    if first is None or len(first.data) == 0:
+        raise ColaError("LMDscandata without DIST1")
+    ranges, remission = ranges_m(first), _remission(scan, "RSSI1", len(first.data))
+    second = scan.channel("DIST2") if echo == "last" else None
+    if second is not None:
+        if len(second.data) != len(first.data):
+            raise ColaError(f"LMDscandata with {len(first.data)} first and {len(second.data)} second echoes")
+        second_ranges, second_remission = ranges_m(second), _remission(scan, "RSSI2", len(second.data))
+        has_two = np.isfinite(second_ranges)
+        ranges = np.where(has_two, second_ranges, ranges)
+        if len(remission) == len(second_remission):
+            remission = np.where(has_two, second_remission, remission) if len(remission) else remission
+    return first, ranges, remission
+
+
+def _remission(scan: ScanData, content: str, rays: int) -> NDArray[np.float32]:
+    """(rays,) as the device gives it: 0 is too weak, 255 or 65535 dazzled; (0,) if there is none for each ray."""
+    channel = scan.channel(content)
+    return (channel.data if channel is not None and len(channel.data) == rays else np.empty(0)).astype(np.float32)
+
+
+def to_scan(scan: ScanData, transmitted_ns: int, period_us: float, echo: str = "first") -> Scan:
     """A sweep in SI units, the scanner's frame and host time, to which `transmitted_ns` (monotonic) takes its time of
-    transmission; `period_us` is one turn of the head.
+    transmission; `period_us` is one turn of the head, `echo` "first" or "last". It is complete when it is transmitted.
 
     Raises:
-        ColaError: the scan holds no distances.
+        ColaError: the scan holds no distances, or is one that no scanner can make.
     """
-    distances = scan.channel("DIST1")
-    if distances is None or len(distances.data) == 0:
-        raise ColaError("LMDscandata without DIST1")
-    remission = scan.channel("RSSI1")
-    rays = len(distances.data)
-    delay_us = first_ray_delay_us(distances.start_angle_1e4deg, period_us)
-    duration_us = sweep_us(rays, distances.angular_step_1e4deg, period_us)
+    channel, ranges, remission = echoes(scan, echo)
+    start, step, rays = channel.start_angle_1e4deg, channel.angular_step_1e4deg, len(channel.data)
+    if abs(start) > TURN_1E4DEG or not 0 < step * max(rays - 1, 1) <= TURN_1E4DEG:
+        raise ColaError(f"LMDscandata with {rays} rays from {start * 1e-4:g}° in steps of {step * 1e-4:g}°")
+    delay_us = first_ray_delay_us(start, period_us)
+    duration_us = sweep_us(rays, step, period_us)
     index_age_us: float = (scan.time_of_transmission_us - scan.time_since_startup_us) % WRAP_US
-    if index_age_us < delay_us + duration_us:
-        index_age_us += period_us
+    if index_age_us > MAX_AGE_US:
+        raise ColaError(f"LMDscandata transmitted {index_age_us * 1e-6:.1f} s after its sweep")
+    index_age_us += period_us * max(0, math.ceil((delay_us + duration_us - index_age_us) / period_us))
     measured_ns = transmitted_ns - round(1000 * (index_age_us - delay_us))
-    has_intensities = remission is not None and len(remission.data) == rays
     return Scan(
         measured_ns=measured_ns,
         complete_ns=measured_ns + round(1000 * duration_us),
-        ranges_m=ranges_m(distances),
-        intensities=(remission.data if remission and has_intensities else np.empty(0)).astype(np.float32),
-        angle_min_rad=math.radians((distances.start_angle_1e4deg - AHEAD_1E4DEG) / 1e4),
-        angle_increment_rad=math.radians(distances.angular_step_1e4deg / 1e4),
-        time_increment_s=sweep_us(2, distances.angular_step_1e4deg, period_us) * 1e-6,
+        ranges_m=ranges,
+        intensities=remission,
+        angle_min_rad=math.radians((start - AHEAD_1E4DEG) / 1e4),
+        angle_increment_rad=math.radians(step / 1e4),
+        time_increment_s=sweep_us(2, step, period_us) * 1e-6,
         scan_time_s=period_us * 1e-6,
         range_min_m=RANGE_MIN_M,
         range_max_m=RANGE_MAX_M,
