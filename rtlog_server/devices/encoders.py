@@ -13,6 +13,7 @@ possible movement, the total is *doubtful*: the least movement is taken, and the
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hw_profiles.profile import Encoder
@@ -21,6 +22,15 @@ MAX_SPEED_M_S = 5.0  # of a wheel whose speed is not known yet
 MAX_ACCELERATION_M_S2 = 5.0  # more than loose ground lets any wheel brake by; one that spins on it comes out doubtful
 MARGIN_TURNS = 0.1  # what the jitter of stamps and speed may add to a movement
 MAX_SPEED_AGE_NS = 500_000_000  # over a longer gap two readings tell no speed
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """What one encoder told: counts within its turn, or modulo many turns if it counts turns itself."""
+
+    raw: int
+    latched_ns: int  # monotonic
+    complete_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,3 +107,50 @@ class TurnCounter:
         self._rate = (total - last) / elapsed_s if known else None
         self._last = total, latched_ns
         return total, doubtful
+
+
+class ReadingMaker:
+    """Makes a reading of the fixes of a round. The wheels count on over a reconnect: they kept their places meanwhile.
+
+    Args:
+        encoders: of the profile; readings list them in this order.
+        moduli: by name, where the raw counts of each start again.
+    """
+
+    def __init__(self, encoders: Sequence[Encoder], moduli: Mapping[str, int]) -> None:
+        self._encoders = list(encoders)
+        self._moduli: dict[str, int] = {}
+        self._counters: dict[str, TurnCounter] = {}
+        for name, modulus in moduli.items():
+            self.set_modulus(name, modulus)
+
+    def set_modulus(self, name: str, modulus: int) -> None:
+        """An encoder that counts otherwise than before is counted anew."""
+        if self._moduli.get(name) == modulus:
+            return
+        self._moduli[name] = modulus
+        encoder = next(encoder for encoder in self._encoders if encoder.name == name)
+        if encoder.role != "steering" and encoder.wheel_radius_m is not None:
+            self._counters[name] = TurnCounter(encoder.counts_per_turn, modulus, encoder.wheel_radius_m)
+
+    def reading(self, fixes: Mapping[str, Fix]) -> EncoderReading:
+        """The reading of at least one fix; encoders without one are left out."""
+        answered = [encoder for encoder in self._encoders if encoder.name in fixes]
+        counts, doubtful = [], []
+        for encoder in answered:
+            total, in_doubt = self._count(encoder, fixes[encoder.name])
+            counts.append(total)
+            if in_doubt:
+                doubtful.append(encoder.name)
+        return EncoderReading(
+            measured_ns=sum(fix.latched_ns for fix in fixes.values()) // len(fixes),
+            complete_ns=max(fix.complete_ns for fix in fixes.values()),
+            names=tuple(encoder.name for encoder in answered),
+            counts=tuple(counts),
+            positions_rad=tuple(position_rad(encoder, total) for encoder, total in zip(answered, counts, strict=True)),
+            doubtful=tuple(doubtful),
+        )
+
+    def _count(self, encoder: Encoder, fix: Fix) -> tuple[int, bool]:
+        counter = self._counters.get(encoder.name)
+        return counter.count(fix.raw, fix.latched_ns) if counter else (fix.raw % encoder.counts_per_turn, False)

@@ -15,11 +15,10 @@ USB adapter, so their arrival says less.
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.device import Device, DeviceError, TickGrid
-from rtlog_server.devices.encoders import EncoderReading, TurnCounter, position_rad
+from rtlog_server.devices.encoders import EncoderReading, Fix, ReadingMaker
 from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.identity import identify_encoder
 from rtlog_server.devices.sei.port import SeiPort
@@ -29,15 +28,6 @@ TURNAROUND_NS = 500_000  # first guess of what a reply takes beyond the wire
 SMOOTHING = 8  # rounds over which the length of a round is averaged
 SILENT_ROUNDS = 5  # without any answer, then the port is opened anew
 BAUD_RECOVERY_ASKS = 10  # an encoder that lost its power is at 9600 baud again
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """One encoder's position: counts within its turn, or modulo 65536 turns in multi-turn mode."""
-
-    raw: int
-    latched_ns: int
-    complete_ns: int
 
 
 class SeiEncoders(Device[EncoderReading]):
@@ -57,16 +47,8 @@ class SeiEncoders(Device[EncoderReading]):
         self._multi_turn = bus.turns == "multi"
         self._reply_bytes = protocol.position_reply_bytes(self._multi_turn)
         self._port: SeiPort | None = None
-        # The wheels count on over a reconnect: they kept their places meanwhile.
-        self._counters = {
-            encoder.name: TurnCounter(
-                encoder.counts_per_turn,
-                encoder.counts_per_turn * (protocol.TURNS if self._multi_turn else 1),
-                encoder.wheel_radius_m,
-            )
-            for encoder in self._encoders
-            if encoder.wheel_radius_m is not None and encoder.role != "steering"
-        }
+        turns = protocol.TURNS if self._multi_turn else 1
+        self._maker = ReadingMaker(encoders, {e.name: e.counts_per_turn * turns for e in encoders})
         self._silent: dict[str, int] = {}  # encoder → how often it was asked in vain
         self._silent_rounds = 0
         self._round_ns = len(self._encoders) * (protocol.wire_ns(1 + self._reply_bytes, bus.baud) + TURNAROUND_NS)
@@ -111,7 +93,9 @@ class SeiEncoders(Device[EncoderReading]):
         self._tally["retries"] += len(missed)
         fixes |= self._ask_all(port, missed)
         if fixes:
-            self.hand_over(self._reading(fixes))
+            reading = self._maker.reading(fixes)
+            self._tally["doubtful turns"] += len(reading.doubtful)
+            self.hand_over(reading)
         self._silent |= {name: 0 for name in missed if name not in fixes}
         self._seek_silent(port)
         self._tell_health(port)
@@ -138,28 +122,6 @@ class SeiEncoders(Device[EncoderReading]):
             return None
         arrived_ns = exchange.sent_ns + protocol.wire_ns(len(request), self._bus.baud)
         return Fix(raw, arrived_ns - protocol.SNAPSHOT_NS // 2, exchange.complete_ns)
-
-    def _reading(self, fixes: dict[str, Fix]) -> EncoderReading:
-        answered = [encoder for encoder in self._encoders if encoder.name in fixes]
-        counts, doubtful = [], []
-        for encoder in answered:
-            fix = fixes[encoder.name]
-            counter = self._counters.get(encoder.name)
-            total, in_doubt = (
-                counter.count(fix.raw, fix.latched_ns) if counter else (fix.raw % encoder.counts_per_turn, False)
-            )
-            counts.append(total)
-            if in_doubt:
-                doubtful.append(encoder.name)
-        self._tally["doubtful turns"] += len(doubtful)
-        return EncoderReading(
-            measured_ns=sum(fix.latched_ns for fix in fixes.values()) // len(fixes),
-            complete_ns=max(fix.complete_ns for fix in fixes.values()),
-            names=tuple(encoder.name for encoder in answered),
-            counts=tuple(counts),
-            positions_rad=tuple(position_rad(encoder, total) for encoder, total in zip(answered, counts, strict=True)),
-            doubtful=tuple(doubtful),
-        )
 
     def _seek_silent(self, port: SeiPort) -> None:
         """Ask one of the silent ones a round, the reading being handed over, so that it costs the others nothing."""
