@@ -13,15 +13,19 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hw_profiles.command import add_verb, run_verbs
+from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
 from rtlog_client.audit import audit
+from rtlog_client.faults import load_faults
 from rtlog_client.live_line import LiveLine
 from rtlog_client.log_file import read_info
 from rtlog_client.record import record
 from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
 from rtlog_client.recover import recover
-from rtlog_client.replay import serve_devices
+from rtlog_client.replay import NO_FAULTS, serve_devices
 from rtlog_client.republish import republish
+
+RATE_HELP = "so many times as fast, or max: one recorded tick for each tick of the profile; default: 1"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     verb.add_argument("--start", type=_start, default=0.0, metavar="S", help="so long after the recording's start")
     verb.add_argument("--duration", type=_seconds, metavar="S", help="default: to the end")
+    verb.add_argument("--rate", type=_rate, default=1.0, metavar="R", help=f"to devices: {RATE_HELP}")
+    verb.add_argument("--faults", type=Path, metavar="FILE.toml", help="to devices: what goes wrong at the wire, when")
 
     return run_verbs(parser, argv)
 
@@ -65,6 +71,10 @@ def _seconds(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is no number of seconds above 0")
     return seconds
+
+
+def _rate(text: str) -> float | None:
+    return None if text == "max" else _seconds(text)
 
 
 def _start(text: str) -> float:
@@ -137,9 +147,13 @@ def _replay(args: argparse.Namespace) -> None:
     _log_to_stderr()
     profile_toml = read_profile_text(args.profile)
     profile = parse_profile(profile_toml, args.profile)
+    faults = load_faults(args.faults) if args.faults is not None else NO_FAULTS
     stopping, part = _stop_on_signals(), {"start_s": args.start, "duration_s": args.duration}
     if args.to == "devices":
-        print(json.dumps(asdict(serve_devices(args.recording, profile, stopping, **part))))
+        report = serve_devices(args.recording, profile, stopping, **part, rate=args.rate, faults=faults)
+        print(report.to_json())
+    elif args.rate != 1.0 or args.faults is not None:
+        raise BadInputError("--rate and --faults are for --to devices")
     else:
         print(json.dumps(asdict(republish(args.recording, profile, profile_toml, stopping, **part))))
 

@@ -1,7 +1,7 @@
-"""What a replay takes from a recording: its span, its scans and tag reads in the order of their stamps, its wheels.
+"""What a replay takes from a recording: its span, and its scans and tag reads in the order of their stamps.
 
-In: a recording. Out: `Span`, `Event`s, a `JointTrack`. All times are nanoseconds UTC of the recording. Scans and reads
-are read as they are needed, a second ahead, so that a recording of any length can be replayed.
+In: a recording, ours or another system's. Out: `Span`, `Event`s. All times are nanoseconds UTC of the recording. Scans
+and reads are read as they are needed, a second ahead, so that a recording of any length can be replayed.
 """
 
 import heapq
@@ -11,14 +11,17 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hw_profiles.errors import BadInputError
 from rtlog_client.log_file import read_info, read_messages
 from rtlog_server.messages import decode, to_ns
-from rtlog_server.topics import JOINT_STATES, TAGS
+from rtlog_server.topics import AUXILIARY_SCAN, PRIMARY_SCAN, TAGS
 
+# Topics of a device, by its name; of several, a recording holds one: other systems know a single `/scan`.
+TOPICS = {
+    "laser/primary": (PRIMARY_SCAN.name, "/scan"),
+    "laser/auxiliary": (AUXILIARY_SCAN.name,),
+    "rfid": (TAGS.name,),
+}
 REORDER_NS = 1_000_000_000  # no sample was recorded later than this after its stamp
 
 
@@ -35,21 +38,8 @@ class Span:
 class Event:
     stamp_ns: int
     order: int  # in the recording
-    topic: str = field(compare=False)
+    device: str = field(compare=False)
     content: Any = field(compare=False)  # a LaserScan, or one TagRead
-
-
-@dataclass(frozen=True, slots=True)
-class JointTrack:
-    """Recorded positions of the encoders, and in between."""
-
-    start_ns: int
-    elapsed_ns: NDArray[np.float64]  # (N,) since the start, ascending; a float cannot hold the nanoseconds since 1970
-    positions_rad: dict[str, NDArray[np.float64]]  # name: (N,), without jumps at ±π
-
-    def angle(self, name: str, recorded_ns: int) -> float:
-        """Linear from reading to reading; before the first and after the last the wheel stands still."""
-        return float(np.interp(recorded_ns - self.start_ns, self.elapsed_ns, self.positions_rad[name]))
 
 
 def read_span(recording: Path, start_s: float, duration_s: float | None) -> Span:
@@ -63,8 +53,10 @@ def read_span(recording: Path, start_s: float, duration_s: float | None) -> Span
     return Span(start_ns, end_ns, info.start_ns)
 
 
-def read_events(recording: Path, topics: Collection[str], span: Span) -> Iterator[Event]:
+def read_events(recording: Path, devices: Collection[str], span: Span) -> Iterator[Event]:
     """Scans and tag reads of the ticks within the span, in the order of their stamps."""
+    there = read_info(recording).message_counts
+    topics = {next((topic for topic in TOPICS[device] if there.get(topic)), ""): device for device in devices}
     waiting: list[Event] = []
     order = count()
     for message in read_messages(recording, list(topics)):
@@ -72,35 +64,14 @@ def read_events(recording: Path, topics: Collection[str], span: Span) -> Iterato
             break
         if message.log_time_ns < span.start_ns:
             continue
-        content = decode(message.data, message.msgtype)
-        if message.topic == TAGS.name:
-            found = [Event(to_ns(read.stamp), next(order), message.topic, read) for read in content.reads]
+        content, device = decode(message.data, message.msgtype), topics[message.topic]
+        if device == "rfid":
+            found = [Event(to_ns(read.stamp), next(order), device, read) for read in content.reads]
         else:
-            found = [Event(to_ns(content.header.stamp), next(order), message.topic, content)]
+            found = [Event(to_ns(content.header.stamp), next(order), device, content)]
         for event in found:
             heapq.heappush(waiting, event)
         while waiting and waiting[0].stamp_ns <= message.log_time_ns - REORDER_NS:
             yield heapq.heappop(waiting)
     while waiting:
         yield heapq.heappop(waiting)
-
-
-def read_joint_track(recording: Path, names: Collection[str]) -> JointTrack:
-    """The whole recording's. Raises: BadInputError: it lacks an encoder, or all of them."""
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for message in read_messages(recording, [JOINT_STATES.name]):
-        state = decode(message.data, message.msgtype)
-        position = dict(zip(state.name, state.position, strict=False))
-        if missing := [name for name in names if name not in position]:
-            there = ", ".join(state.name)
-            raise BadInputError(f"{recording}: {JOINT_STATES.name} lacks {', '.join(missing)}; it has {there}")
-        stamps.append(to_ns(state.header.stamp))
-        rows.append([position[name] for name in names])
-    if not rows:
-        raise BadInputError(f"{recording}: no {JOINT_STATES.name} in it, and the profile has encoders")
-    start_ns = min(stamps)
-    elapsed_ns = np.array([stamp - start_ns for stamp in stamps], np.float64)
-    ascending = np.argsort(elapsed_ns, kind="stable")
-    columns = np.unwrap(np.array(rows)[ascending], axis=0).T
-    return JointTrack(start_ns, elapsed_ns[ascending], dict(zip(names, columns, strict=True)))

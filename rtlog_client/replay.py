@@ -3,9 +3,10 @@
     recording     standing still . . . |scan     scan   tag  scan         UTC of the recording
     this host   now ───── lead ────────┼─────────┼──────┼────┼─────       UTC of the recording + offset_ns
 
-In: a recording, a profile with the addresses where the devices are to stand. Out: emulators that measure at the
-recorded times, and a `ReplayReport`. The law: the offset is fixed at the start. It puts recorded ticks on whole
-multiples of the tick period in UTC, as a server's are, so that each sample comes in the tick in which it was recorded.
+In: a recording, a profile with the addresses where the devices are to stand, a fault script. Out: emulators that
+measure at the recorded times, and a `ReplayReport`. The law: the offset is fixed at the start. It puts recorded ticks
+on whole multiples of the tick period in UTC, as a server's are, so that each sample comes in the tick in which it was
+recorded. At a rate of r all goes r times as fast; a server with ticks of 1/r of the recorded period then sees the same.
 
 Scans and tags come at their recorded stamps; the wheels turn evenly from one recorded reading to the next. Until the
 start the vehicle stands still: its scanner sends the first scan again and again, as no scanner falls silent.
@@ -17,20 +18,23 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from hw_profiles.errors import BadInputError, RTLogError
-from hw_profiles.profile import Encoder, LaserDevice, Profile, SeiBus
-from rtlog_client.drive_log import Event, JointTrack, Span, read_events, read_joint_track, read_span
-from rtlog_server.devices.alien.emulator import Alr9650Emulator
-from rtlog_server.devices.encoders import counts_at
+from hw_profiles.profile import Profile, parse_profile
+from rtlog_client.drive_log import Event, Span, read_events, read_span
+from rtlog_client.encoder_track import read_encoder_track
+from rtlog_client.fault_player import FaultPlayer
+from rtlog_client.faults import FaultScript, check_devices
+from rtlog_client.log_file import read_info
+from rtlog_client.replay_report import ReplayReport
+from rtlog_client.stage import Stage, addressed_devices, addressed_lasers
+from rtlog_client.stalls import StallWatch
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
-from rtlog_server.devices.sei.emulator import SeiBusEmulator
 from rtlog_server.ticker import utc_offset_ns
-from rtlog_server.topics import AUXILIARY_SCAN, PRIMARY_SCAN, TAGS
 
 log = logging.getLogger(__name__)
 
@@ -38,26 +42,8 @@ LEAD_S = 3.0  # a server that looks for its devices finds them within two
 TAIL_S = 0.5  # after the end, so that the last samples are still collected
 STANDING = -1  # Event.order of a scan before the start
 SCAN_AHEAD_NS = 20_000_000  # a scan is given to its emulator so long before the first ray
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayReport:
-    """`offset_ns`, added to times of the recording or of its truth, gives UTC of this host."""
-
-    offset_ns: int
-    start_ns: int  # in the recording
-    end_ns: int
-    scans: int
-    unheard_scans: int  # of these, sent while no server listened
-    tag_reads: int
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """The emulators."""
-
-    lasers: dict[str, Lms111Emulator]  # by topic
-    reader: Alr9650Emulator | None
+DEFAULT_PERIOD_S = 0.1  # of recordings that do not say
+NO_FAULTS = FaultScript()
 
 
 def serve_devices(
@@ -68,108 +54,85 @@ def serve_devices(
     start_s: float = 0.0,
     duration_s: float | None = None,
     lead_s: float = LEAD_S,
+    rate: float | None = 1.0,
+    faults: FaultScript = NO_FAULTS,
 ) -> ReplayReport:
     """Be the devices of `profile` until the recording, or the part of it, is over or `stopping` is set.
 
+    `rate` says how much faster than it was recorded; None: one recorded tick for each tick of the profile.
+
     Raises:
-        BadInputError: the recording lacks what a device of the profile measures, or the profile has no devices.
+        BadInputError: the recording lacks what a device of the profile measures, the profile has no devices, or lacks
+            one that a fault is for.
         RTLogError: an address is taken, or a scan is one that no such scanner can measure.
     """
+    check_devices(faults, addressed_devices(profile), profile.name)
     span = read_span(recording, start_s, duration_s)
-    lasers = _laser_addresses(profile)
-    first_scans = [_first_scan(recording, topic, span) for topic in lasers]
-    names = [encoder.name for encoder in profile.encoders]
-    track = read_joint_track(recording, names) if profile.encoder_bus is not None else None
-    topics = [*lasers, *([TAGS.name] if profile.rfid is not None else [])]
-    events = read_events(recording, topics, span)
+    rate = rate or recorded_period_s(recording) / profile.tick_period_s
+    lasers = list(addressed_lasers(profile))
+    first_scans = [_first_scan(recording, name, span) for name in lasers]
+    track = read_encoder_track(recording, profile) if profile.encoder_bus is not None else None
+    events = read_events(recording, [*lasers, *(["rfid"] if profile.rfid is not None else [])], span)
 
-    period_ns = round(profile.tick_period_s * 1e9)
     utc_ns = utc_offset_ns()
-    offset_ns = _aligned_offset(span, time.monotonic_ns() + utc_ns + round(lead_s * 1e9), period_ns)
-    clock_ns = offset_ns - utc_ns  # monotonic clock minus time of the recording
+    report = _timeline(span, time.monotonic_ns() + utc_ns + round(lead_s * 1e9), profile.tick_period_s, rate)
+
+    def angle(name: str, at_ns: int) -> float:
+        assert track is not None  # there is an encoder bus
+        return track.angle(name, report.recorded_ns(at_ns + utc_ns))
+
     with ExitStack() as stack:
-        stage = _open_stage(profile, track, clock_ns, stack)
-        log.info("standing still for %g s, then %.1f s of drive", lead_s, (span.end_ns - span.start_ns) * 1e-9)
-        standing = _standing_still(first_scans, math.ceil(lead_s * 1e9 / period_ns), period_ns)
-        counts = _play(chain(standing, events), stage, clock_ns, stopping)
-        stopping.wait(max(0.0, (span.end_ns + clock_ns - time.monotonic_ns()) * 1e-9) + TAIL_S)
-    return ReplayReport(offset_ns, span.start_ns, span.end_ns, *counts)
+        watch = stack.enter_context(StallWatch(utc_ns))
+        stage = stack.enter_context(Stage(profile, angle, faults.devices, faults.seed))
+        length_s = (span.end_ns - span.start_ns) * 1e-9
+        log.info("standing still for %g s, then %.1f s of drive at %g times its speed", lead_s, length_s, rate)
+        player = FaultPlayer(faults, stage.lines, report.host_ns(span.start_ns) - utc_ns, utc_ns)
+        stack.callback(player.close)
+        standing = _standing_still(first_scans, math.ceil(lead_s / profile.tick_period_s), profile.tick_period_s * rate)
+        counts = _play(chain(standing, events), stage, report, utc_ns, stopping)
+        stopping.wait(max(0.0, (report.host_ns(span.end_ns) - utc_ns - time.monotonic_ns()) * 1e-9) + TAIL_S)
+    scans, unheard, reads = counts
+    return replace(
+        report, scans=scans, unheard_scans=unheard, tag_reads=reads, faults=player.played, stalls=watch.stalls
+    )
 
 
-def _aligned_offset(span: Span, earliest_ns: int, period_ns: int) -> int:
-    """The least offset that starts the span at `earliest_ns` or later and puts ticks on multiples of the period."""
-    phase_ns = span.first_tick_ns % period_ns
-    return -(-(earliest_ns - span.start_ns + phase_ns) // period_ns) * period_ns - phase_ns
+def recorded_period_s(recording: Path) -> float:
+    """From tick to tick of the recording."""
+    text = read_info(recording).profile_toml
+    return DEFAULT_PERIOD_S if text is None else parse_profile(text, f"in {recording}").tick_period_s
 
 
-def _laser_addresses(profile: Profile) -> dict[str, LaserDevice]:
-    """By topic."""
-    lasers = ((PRIMARY_SCAN, profile.lasers.primary), (AUXILIARY_SCAN, profile.lasers.auxiliary))
-    return {topic.name: laser.device for topic, laser in lasers if laser is not None and laser.device is not None}
+def _timeline(span: Span, earliest_ns: int, period_s: float, rate: float) -> ReplayReport:
+    """Starts the span as soon as may be, at `earliest_ns` or later, with ticks on multiples of the period in UTC."""
+    period_ns = round(period_s * 1e9)
+    lag_ns = round((span.start_ns - span.first_tick_ns) / rate)  # of the start behind the recording's first tick
+    start_ns = -(-(earliest_ns - lag_ns) // period_ns) * period_ns + lag_ns
+    return ReplayReport(start_ns - span.start_ns, span.start_ns, span.end_ns, 0, 0, 0, rate)
 
 
-def _first_scan(recording: Path, topic: str, span: Span) -> Event:
-    scan = next(read_events(recording, [topic], span), None)
+def _first_scan(recording: Path, device: str, span: Span) -> Event:
+    scan = next(read_events(recording, [device], span), None)
     if scan is None:
-        raise BadInputError(f"{recording}: no {topic} in the part to replay, and the profile has that laser")
+        raise BadInputError(f"{recording}: no scan of {device} in the part to replay, and the profile has that laser")
     return scan
 
 
-def _open_stage(profile: Profile, track: JointTrack | None, clock_ns: int, stack: ExitStack) -> Stage:
-    """An emulator for every device that has an address."""
-    lasers = {}
-    reader = None
-    where = ""
-    try:
-        for topic, laser in _laser_addresses(profile).items():
-            where = f"{laser.host}:{laser.port}"
-            lasers[topic] = stack.enter_context(Lms111Emulator(laser.host, laser.port))
-        if profile.encoder_bus is not None and track is not None:
-            where = profile.encoder_bus.port
-            stack.enter_context(_encoder_bus(profile.encoder_bus, profile.encoders, track, clock_ns))
-        if profile.rfid is not None and profile.rfid.device is not None:
-            device = profile.rfid.device
-            where = f"{device.host}:{device.port}"
-            reader = stack.enter_context(Alr9650Emulator(device.host, device.port, device.username, device.password))
-    except OSError as error:
-        hint = "the profile must name addresses of this machine that are free"
-        raise RTLogError(f"{where}: {error.strerror or error}; {hint}") from error
-    if not where:
-        raise BadInputError(f"profile {profile.name} gives no device an address: there is nothing to emulate")
-    return Stage(lasers, reader)
-
-
-def _encoder_bus(bus: SeiBus, fitted: list[Encoder], track: JointTrack, clock_ns: int) -> SeiBusEmulator:
-    encoders = {encoder.address: encoder for encoder in fitted if encoder.address is not None}
-
-    def position(address: int, at_ns: int) -> int:
-        encoder = encoders[address]
-        return total_counts(encoder, track.angle(encoder.name, at_ns - clock_ns))
-
-    counts_per_turn = {address: encoder.counts_per_turn for address, encoder in encoders.items()}
-    return SeiBusEmulator(Path(bus.port), counts_per_turn, position, bus.echo == "yes", bus.turns == "multi")
-
-
-def total_counts(encoder: Encoder, angle_rad: float) -> int:
-    """What the encoder counts at this angle: a wheel over many turns, steering within its turn."""
-    if encoder.role == "steering":
-        return counts_at(encoder, angle_rad)
-    return round((-angle_rad if encoder.reversed else angle_rad) / math.tau * encoder.counts_per_turn)
-
-
-def _standing_still(first_scans: list[Event], ticks: int, period_ns: int) -> Iterator[Event]:
+def _standing_still(first_scans: list[Event], ticks: int, spacing_s: float) -> Iterator[Event]:
     """The first scan of each laser, once for each tick before it."""
     for ahead in range(ticks, 0, -1):
         for scan in sorted(first_scans):
-            yield Event(scan.stamp_ns - ahead * period_ns, STANDING, scan.topic, scan.content)
+            yield Event(scan.stamp_ns - round(ahead * spacing_s * 1e9), STANDING, scan.device, scan.content)
 
 
-def _play(events: Iterator[Event], stage: Stage, clock_ns: int, stopping: threading.Event) -> tuple[int, int, int]:
+def _play(
+    events: Iterator[Event], stage: Stage, report: ReplayReport, utc_ns: int, stopping: threading.Event
+) -> tuple[int, int, int]:
     """Give each event to its emulator when its time has come. Returns: scans, unheard scans, tag reads."""
     scans = unheard = reads = 0
     for event in events:
-        at_ns = event.stamp_ns + clock_ns
-        laser = stage.lasers.get(event.topic)
+        at_ns = report.host_ns(event.stamp_ns) - utc_ns
+        laser = stage.lasers.get(event.device)
         ahead_ns = 0 if laser is None else SCAN_AHEAD_NS
         if stopping.wait(max(0.0, (at_ns - ahead_ns - time.monotonic_ns()) * 1e-9)):
             break

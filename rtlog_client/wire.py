@@ -1,0 +1,139 @@
+"""A wire between a host and an emulated device, and what can go wrong with it.
+
+    host ═══ address of the profile ── Wire ── hidden address ═══ emulator
+                                        │
+                             fault: drop, delay, garble, cut, restart, swap
+
+In: bytes from either end. Out: the same bytes at the other, bent by the fault at hand. The law: a wire knows nothing of
+what it carries, so it serves every device; without a fault every byte passes at once and in order. Drop, delay and
+garble are done to what the device sends.
+"""
+
+import queue
+import random
+import selectors
+import socket
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Self
+
+from rtlog_client.faults import Fault
+
+READ_BYTES = 65536
+
+
+def bend(data: bytes, fault: Fault | None, noise: random.Random) -> bytes:
+    """What is left of `data` from a device under a fault of the bytes."""
+    if fault is None or not data:
+        return data
+    if fault.kind == "drop":
+        return b""
+    if fault.kind == "garble" and fault.share is not None:
+        return bytes(byte ^ noise.randrange(1, 256) if noise.random() < fault.share else byte for byte in data)
+    return data
+
+
+class Wire(ABC):
+    """A thread that owns the wire's state; everything else asks it. A context manager."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        self.fault: Fault | None = None
+        self.noise = random.Random(f"{seed} {name}")  # each wire its own, whatever the others carry
+        self._tasks: queue.SimpleQueue[tuple[Callable[[], None], threading.Event]] = queue.SimpleQueue()
+        self._selector = selectors.DefaultSelector()
+        self._wake, self._waker = socket.socketpair()
+        self._selector.register(self._wake, selectors.EVENT_READ, self._run_tasks)
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"wire {name}", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._call(self._close)
+        self._thread.join()
+        self._wake.close()
+        self._waker.close()
+        self._selector.close()
+
+    def begin(self, fault: Fault) -> None:
+        self._call(lambda: self._begin(fault))
+
+    def end(self) -> None:
+        self._call(self._end)
+
+    # In the thread
+
+    @abstractmethod
+    def _begin(self, fault: Fault) -> None: ...
+    @abstractmethod
+    def _end(self) -> None: ...
+    @abstractmethod
+    def _flush(self) -> float | None:
+        """Send what is due; how long until more is (None: nothing waits)."""
+
+    @abstractmethod
+    def _shut(self) -> None:
+        """Release everything."""
+
+    def _call(self, function: Callable[[], None]) -> None:
+        done = threading.Event()
+        self._tasks.put((function, done))
+        self._waker.send(b"\0")
+        done.wait()
+
+    def _run_tasks(self) -> None:
+        self._wake.recv(4096)
+        while not self._tasks.empty():
+            function, done = self._tasks.get()
+            function()
+            done.set()
+
+    def _run(self) -> None:
+        wait_s = None
+        while not self._closing:
+            for key, _ in self._selector.select(wait_s):
+                key.data()
+            wait_s = self._flush() if not self._closing else None
+
+    def _close(self) -> None:
+        self._closing = True
+        self._shut()
+
+    def _watch(self, end: Any, function: Callable[[], None]) -> None:
+        self._selector.register(end, selectors.EVENT_READ, function)
+
+    def _ignore(self, end: Any) -> None:
+        if end in self._selector.get_map():
+            self._selector.unregister(end)
+
+
+class Flow:
+    """One direction: bytes that wait for their time, in order; b"" is the end."""
+
+    def __init__(self, write: Callable[[bytes], Any], from_device: bool) -> None:
+        self.ended = False
+        self._write = write
+        self._from_device = from_device
+        self._waiting: deque[tuple[float, bytes]] = deque()
+
+    def put(self, data: bytes, wire: Wire) -> None:
+        due_s = time.monotonic()
+        if self._from_device:
+            fault = wire.fault
+            if data and not (data := bend(data, fault, wire.noise)):
+                return
+            due_s += fault.by_s or 0.0 if fault is not None else 0.0
+        self._waiting.append((max(due_s, self._waiting[-1][0] if self._waiting else 0.0), data))
+
+    def flush(self) -> float | None:
+        """Send what is due; how long until more is. Raises: OSError: the other end is gone."""
+        while self._waiting and (left_s := self._waiting[0][0] - time.monotonic()) <= 0:
+            _, data = self._waiting.popleft()
+            self._write(data)
+            self.ended = self.ended or not data
+        return left_s if self._waiting else None
