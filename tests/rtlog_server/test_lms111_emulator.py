@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rtlog_server.devices.lms111.cola import Dialect, Receiver, frame
-from rtlog_server.devices.lms111.emulated_scanner import quantise_ranges
+from rtlog_server.devices.lms111.emulated_sweep import quantise_ranges
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.lms111.protocol import AUTHORISED_CLIENT, Command, decode, encode_command
 from rtlog_server.devices.lms111.scan_data import ScanData

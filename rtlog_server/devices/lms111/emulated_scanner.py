@@ -7,13 +7,10 @@ configuration, its counters and its clock; without a login it changes nothing; o
 
 import math
 import time
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from rtlog_server.clock import WRAP_US
+from rtlog_server.devices.lms111.emulated_sweep import Sweep, echo_channels
 from rtlog_server.devices.lms111.protocol import (
     ACCESS_DENIED,
     AUTHORISED_CLIENT,
@@ -28,23 +25,16 @@ from rtlog_server.devices.lms111.protocol import (
     Command,
     reply_name,
 )
-from rtlog_server.devices.lms111.scan_data import Channel, ScanData
+from rtlog_server.devices.lms111.scan_data import ScanData
 from rtlog_server.devices.lms111.sweep import (
-    AHEAD_1E4DEG,
     FIELD_START_1E4DEG,
     FIELD_STOP_1E4DEG,
-    LOWEST_DISTANCE,
-    NO_ECHO,
     first_ray_delay_us,
     sweep_us,
 )
 
-REJECTED = 3  # the code that real devices send where neighbours vanish
 PAIRS = ((2500, 2500), (5000, 5000))  # scan frequency 1/100 Hz and resolution 1/10000° that go together
 SHOTS_PER_SECOND = 36_000  # at 50 Hz and 0.5° as at 25 Hz and 0.25°
-MAX_RAYS = 10_000
-MAX_STEP_RAD = math.radians(6.5)
-MAX_ANGLE_RAD = 2 * math.pi
 FACTORY: dict[str, tuple[Any, ...]] = {
     "LMPscancfg": (2500, 1, 2500, FIELD_START_1E4DEG, FIELD_STOP_1E4DEG),
     "LMPoutputRange": (1, 2500, FIELD_START_1E4DEG, FIELD_STOP_1E4DEG),
@@ -60,34 +50,6 @@ FIXED: dict[str, tuple[Any, ...]] = {
 CONTAMINATION_OF_STATUS = {2: 1, 4: 2, 5: 2}  # LCMstate by the device status of the scans
 WRITABLE = ("LMPoutputRange", "LMDscandatacfg", "EIHstCola")
 DONE = {"LMCstandby": 0, "mEEwriteall": 1, "LSPsetdatetime": 1}  # methods that only say that all went well
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
-    """One turn's rays, quantised, in the scanner's frame (x ahead, counter-clockwise)."""
-
-    first_ray_ns: int
-    distances: NDArray[np.uint16]  # (N,) mm, or a code
-    angle_min_rad: float
-    angle_increment_rad: float
-    remission: NDArray[np.float64] | None  # (N,)
-
-
-def make_sweep(
-    ranges_m: ArrayLike,
-    first_ray_ns: int,
-    angle_min_rad: float,
-    angle_increment_rad: float,
-    intensities: ArrayLike | None,
-) -> Sweep:
-    """A sweep of (N,) ranges and as many intensities, or none. Raises: ValueError, if no scanner can measure it."""
-    ranges = np.asarray(ranges_m, np.float64)
-    remission = None if intensities is None or np.size(intensities) == 0 else np.asarray(intensities, np.float64)
-    if ranges.ndim != 1 or ranges.size > MAX_RAYS or (remission is not None and remission.shape != ranges.shape):
-        raise ValueError("a sweep is one row of ranges, and as many intensities or none")
-    if not 0 < angle_increment_rad <= MAX_STEP_RAD or not abs(angle_min_rad) <= MAX_ANGLE_RAD:
-        raise ValueError(f"rays from {angle_min_rad} rad in steps of {angle_increment_rad} rad")
-    return Sweep(first_ray_ns, quantise_ranges(ranges), angle_min_rad, angle_increment_rad, remission)
 
 
 class EmulatedScanner:
@@ -207,29 +169,18 @@ class EmulatedScanner:
         return Command(reply, (0,))
 
     def last_ray_ns(self, sweep: Sweep) -> int:
-        step = round(math.degrees(sweep.angle_increment_rad) * 1e4)
-        return sweep.first_ray_ns + round(1000 * sweep_us(len(sweep.distances), step, self.period_us()))
+        duration_us = sweep_us(len(sweep.echoes[0].ranges), sweep.step_1e4deg, self.period_us())
+        return sweep.first_ray_ns + round(1000 * duration_us)
 
     def scan_data(self, sweep: Sweep, now_ns: int) -> ScanData:
         """The telegram of a sweep that is transmitted now; counts it."""
-        start = round(math.degrees(sweep.angle_min_rad) * 1e4) + AHEAD_1E4DEG
-        step = round(math.degrees(sweep.angle_increment_rad) * 1e4)
-        index_ns = sweep.first_ray_ns - round(1000 * first_ray_delay_us(start, self.period_us()))
+        index_ns = sweep.first_ray_ns - round(1000 * first_ray_delay_us(sweep.start_1e4deg, self.period_us()))
         turns = max(1, round((index_ns - self._index_ns) / (1000 * self.period_us())))
         self._index_ns = index_ns
         self._telegram_counter = (self._telegram_counter + 1) % 65536
         self._scan_counter = (self._scan_counter + turns) % 65536
-        channels = [Channel("DIST1", 1.0, 0.0, start, step, sweep.distances)]
-        channels8: list[Channel] = []
-        with_remission, in_16_bit = self._variables["LMDscandatacfg"][2:4]
-        if with_remission and sweep.remission is not None:
-            remission = np.round(np.nan_to_num(sweep.remission))
-            if in_16_bit:
-                data16 = np.clip(remission, 0, 65535).astype(np.uint16)
-                channels.append(Channel("RSSI1", 1.0, 0.0, start, step, data16))
-            else:
-                data8 = np.clip(remission, 0, 255).astype(np.uint8)
-                channels8.append(Channel("RSSI1", 1.0, 0.0, start, step, data8))
+        echoes, _, with_remission, in_16_bit = self._variables["LMDscandatacfg"][:4]
+        channels16, channels8 = echo_channels(sweep, echoes, bool(with_remission), bool(in_16_bit))
         self.newest = ScanData(
             version=1,
             device_no=1,
@@ -245,18 +196,10 @@ class EmulatedScanner:
             scan_frequency_centihz=self._variables["LMPscancfg"][0],
             measurement_frequency_100hz=SHOTS_PER_SECOND // 100,
             encoders=(),
-            channels16=tuple(channels),
-            channels8=tuple(channels8),
+            channels16=channels16,
+            channels8=channels8,
         )
         return self.newest
 
     def _clock_us(self, host_ns: int) -> int:
         return (self._offset_us + math.floor((host_ns - self._power_up_ns) * self._rate_per_ns)) % WRAP_US
-
-
-def quantise_ranges(ranges_m: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
-    """(N,) millimetres: 0 for +inf and what is too far for 16 bits, a code for NaN and what no range is as near as."""
-    millimetres = np.round(np.nan_to_num(ranges_m, nan=0.0, posinf=np.inf, neginf=0.0) * 1000)
-    codes = np.where(millimetres < LOWEST_DISTANCE, REJECTED, NO_ECHO)
-    measured = (millimetres >= LOWEST_DISTANCE) & (millimetres <= 65535)
-    return np.where(measured, millimetres, codes).astype(np.uint16)

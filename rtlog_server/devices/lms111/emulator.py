@@ -9,21 +9,19 @@ Its faults are those of the field: a cable pulled, a connection cut, a port that
 no telegram.
 """
 
-import heapq
-import itertools
-import queue
-import selectors
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Self
 
 from numpy.typing import ArrayLike
 
 from rtlog_server.devices.lms111.cola import ColaError, Dialect, Receiver
-from rtlog_server.devices.lms111.emulated_scanner import EmulatedScanner, Sweep, make_sweep
+from rtlog_server.devices.lms111.emulated_scanner import EmulatedScanner
+from rtlog_server.devices.lms111.emulated_sweep import Sweep, make_sweep
+from rtlog_server.devices.lms111.event_loop import EventLoop
 from rtlog_server.devices.lms111.protocol import (
     CONDITION_FAILED,
     INVALID_DATA,
@@ -72,18 +70,13 @@ class Lms111Emulator:
         self._receiver = Receiver(self._dialect)
         self._silent = False
         self._streaming = threading.Event()
-        self._tasks: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...], threading.Event]] = (
-            queue.SimpleQueue()
-        )
-        self._timers: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
-        self._order = itertools.count()
-        self._selector = selectors.DefaultSelector()
-        self._wake, self._waker = socket.socketpair()
-        self._selector.register(self._wake, selectors.EVENT_READ, self._run_tasks)
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name="lms111 emulator", daemon=True)
-        self._thread.start()
+        self._delay_ns: Callable[[], int] = lambda: 0
+        self._sent_by_ns = 0
+        self._errors: dict[str, int] = {}
+        self._loop = EventLoop("lms111 emulator")
+        self._loop.watch(self._listener, self._accept)
+        self._closed = False
+        self._loop.start()
 
     def __enter__(self) -> Self:
         return self
@@ -92,9 +85,10 @@ class Lms111Emulator:
         self.close()
 
     def close(self) -> None:
-        if not self._closing:
-            self._call(self._close)
-            self._thread.join()
+        if not self._closed:
+            self._closed = True
+            self._loop.call(self._stop_listening)
+            self._loop.close()
 
     # For whoever drives it
 
@@ -109,6 +103,8 @@ class Lms111Emulator:
         angle_min_rad: float,
         angle_increment_rad: float,
         intensities: ArrayLike | None = None,
+        second_ranges_m: ArrayLike | None = None,
+        second_intensities: ArrayLike | None = None,
     ) -> None:
         """Measure and send a sweep; returns at once, the scan goes out after its last ray.
 
@@ -118,81 +114,75 @@ class Lms111Emulator:
             angle_min_rad: of the first ray, in the scanner's frame.
             angle_increment_rad: above 0, up to 6.5°.
             intensities: (N,) sent if the client asked for remission; None or empty: there are none.
+            second_ranges_m: (N,) of the second echo; +inf for a ray that has none; None: no ray has one.
+            second_intensities: (N,) of the second echo.
 
         Raises:
             ValueError: no scanner can measure such a sweep.
         """
-        sweep = make_sweep(ranges_m, first_ray_ns, angle_min_rad, angle_increment_rad, intensities)
-        self._post(self._measure, sweep)
+        second = second_ranges_m, second_intensities
+        sweep = make_sweep(ranges_m, first_ray_ns, angle_min_rad, angle_increment_rad, intensities, *second)
+        self._loop.post(self._measure, sweep)
 
     def send_raw(self, data: bytes) -> None:
         """Put any bytes on the wire."""
-        self._call(self._send, data)
+        self._loop.call(self._send, data)
 
     def set_status(self, status: int) -> None:
         """The device status of the scans from now on: 1 error, 2 contamination warning, 4 contamination error."""
-        self._call(setattr, self._scanner, "device_status", (0, status))
+        self._loop.call(setattr, self._scanner, "device_status", (0, status))
 
     def set_temperature(self, outside: bool) -> None:
         """Whether it is outside of its temperature range."""
-        self._call(setattr, self._scanner, "outside_temperature", outside)
+        self._loop.call(setattr, self._scanner, "outside_temperature", outside)
+
+    def set_delivery(self, delay_ns: Callable[[], int]) -> None:
+        """How long each scan is under way from its transmission on; a connection keeps their order."""
+        self._loop.call(setattr, self, "_delay_ns", delay_ns)
+
+    def set_error(self, command: str, code: int | None) -> None:
+        """Answer a command, as in `sRN LMPscancfg`, with the error `code` from now on; None: as usual again."""
+        self._loop.call(self._errors.pop if code is None else self._errors.__setitem__, command, code)
+
+    def stop_streaming(self) -> None:
+        """Forget that the client is registered for scans; go on answering it."""
+        self._loop.call(self._forget_registration)
 
     def drop_connection(self) -> None:
         """Reset the client's connection."""
-        self._call(self._hang_up, True)
+        self._loop.call(self._hang_up, True)
 
     def go_silent(self, silent: bool = True) -> None:
         """Say nothing more, as if the cable were pulled; new connections are taken and met with silence."""
-        self._call(setattr, self, "_silent", silent)
+        self._loop.call(setattr, self, "_silent", silent)
 
     def refuse(self, refusing: bool = True) -> None:
         """Reset the connection and refuse new ones; or take them again."""
-        self._call(self._stop_listening if refusing else self._listen)
+        self._loop.call(self._stop_listening if refusing else self._listen)
 
     def power_cycle(self, off_s: float = 0.5) -> None:
         """Lose power without a word; back with counters, clock and configuration as after any power-up."""
-        self._call(self._power_off, off_s)
+        self._loop.call(self._power_off, off_s)
 
     # In the thread
 
-    def _run(self) -> None:
-        while not self._closing:
-            wait_s = None
-            if self._timers:
-                wait_s = max(0.0, (self._timers[0][0] - time.monotonic_ns()) * 1e-9)
-            for key, _ in self._selector.select(wait_s):
-                key.data()
-            while self._timers and self._timers[0][0] <= time.monotonic_ns():
-                _, _, function, arguments = heapq.heappop(self._timers)
-                function(*arguments)
-
-    def _post(self, function: Callable[..., None], *arguments: Any) -> threading.Event:
-        done = threading.Event()
-        self._tasks.put((function, arguments, done))
-        self._waker.send(b"\0")
-        return done
-
-    def _call(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Have the thread do it, and wait until it is done."""
-        self._post(function, *arguments).wait()
-
-    def _run_tasks(self) -> None:
-        self._wake.recv(4096)
-        while not self._tasks.empty():
-            function, arguments, done = self._tasks.get()
-            function(*arguments)
-            done.set()
-
-    def _at(self, due_ns: int, function: Callable[..., None], *arguments: Any) -> None:
-        heapq.heappush(self._timers, (due_ns, next(self._order), function, arguments))
-
     def _measure(self, sweep: Sweep) -> None:
-        self._at(self._scanner.last_ray_ns(sweep) + READY_AFTER_NS, self._transmit, sweep)
+        self._loop.at(self._scanner.last_ray_ns(sweep) + READY_AFTER_NS, self._transmit, sweep)
 
     def _transmit(self, sweep: Sweep) -> None:
         now_ns = time.monotonic_ns()
         if self._scanner.streaming and self._scanner.state(now_ns) == MEASURING and not self._silent:
-            self._send(encode_scan_data(self._dialect, self._scanner.scan_data(sweep, now_ns)))
+            data = encode_scan_data(self._dialect, self._scanner.scan_data(sweep, now_ns))
+            self._sent_by_ns = max(self._sent_by_ns, now_ns + self._delay_ns())
+            if self._sent_by_ns > now_ns:
+                self._loop.at(self._sent_by_ns, self._send_to, self._client, data)
+            else:
+                self._send(data)
+
+    def _send_to(self, client: socket.socket | None, data: bytes) -> None:
+        """Send what was under way, unless the connection that it was for is gone."""
+        if self._client is client and not self._silent:
+            self._send(data)
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -208,7 +198,7 @@ class Lms111Emulator:
         self._client = connection
         self._dialect = Dialect.B if self._scanner.speaks_cola_b else Dialect.A
         self._receiver = Receiver(self._dialect)
-        self._selector.register(connection, selectors.EVENT_READ, self._receive)
+        self._loop.watch(connection, self._receive)
 
     def _receive(self) -> None:
         if self._client is None:
@@ -232,6 +222,8 @@ class Lms111Emulator:
             command = None
         if command is None or isinstance(command, ScanData) or command.name[:3] not in REPLY_VERBS:
             return encode_command(self._dialect, "sFA", INVALID_DATA)
+        if command.name in self._errors:
+            return encode_command(self._dialect, "sFA", self._errors[command.name])
         if command.name == "sRN LMDscandata":
             newest = self._scanner.newest
             if newest is None:
@@ -254,16 +246,20 @@ class Lms111Emulator:
         if self._client is not None:
             if reset:
                 self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_ON_CLOSE)
-            self._selector.unregister(self._client)
+            self._loop.forget(self._client)
             self._client.close()
             self._client = None
         self._scanner.hang_up()
         self._streaming.clear()
 
+    def _forget_registration(self) -> None:
+        self._scanner.streaming = False
+        self._streaming.clear()
+
     def _listen(self) -> None:
         if self._listener is None:
             self._listener = socket.create_server(self.address)
-            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+            self._loop.watch(self._listener, self._accept)
 
     def _stop_listening(self) -> None:
         self._hang_up(True)
@@ -271,24 +267,17 @@ class Lms111Emulator:
 
     def _close_listener(self) -> None:
         if self._listener is not None:
-            self._selector.unregister(self._listener)
+            self._loop.forget(self._listener)
             self._listener.close()
             self._listener = None
 
     def _power_off(self, off_s: float) -> None:
         self._silent = True
         self._close_listener()
-        self._at(time.monotonic_ns() + int(off_s * 1e9), self._power_on)
+        self._loop.at(time.monotonic_ns() + int(off_s * 1e9), self._power_on)
 
     def _power_on(self) -> None:
         self._hang_up(True)
         self._scanner.power_up(time.monotonic_ns())
         self._silent = False
         self._listen()
-
-    def _close(self) -> None:
-        self._closing = True
-        self._stop_listening()
-        for end in (self._wake, self._waker):
-            end.close()
-        self._selector.close()
