@@ -22,7 +22,13 @@ Array = NDArray[np.float64]
 
 
 def assemble_atlas(
-    runs: list["DrivenRun"], graph: Graph, placement: Placement, grids: list[Grid], config: "Config", remarks: list[str]
+    runs: list["DrivenRun"],
+    graph: Graph,
+    placement: Placement,
+    grids: list[Grid],
+    config: "Config",
+    remarks: list[str],
+    left_out: list[dict[str, Any]],
 ) -> Atlas:
     trajectories = {}
     for number, driven in enumerate(runs):
@@ -44,6 +50,7 @@ def assemble_atlas(
         ],
         "nodes": [_node(k, runs, graph, placement) for k in range(len(graph.nodes))],
         "edges": [_edge(piece, runs, placement) for piece in placement.pieces],
+        "left_out": left_out,
         "remarks": remarks,
     }
     edges: dict[str, Mapping[str, NDArray[Any]]] = {
@@ -66,13 +73,14 @@ def _node(k: int, runs: list["DrivenRun"], graph: Graph, placement: Placement) -
         "x": _metres(x),
         "y": _metres(y),
         "theta": _metres(theta),
-        "range": _metres(float(np.mean([found.range_m for _, found in passes]))),
+        "range": _metres(float(np.mean([found.range_m for _, found in passes if found.read]))),
         "part": int(placement.node_parts[k]),
         "passes": [
             {
                 "run": runs[run].run.run_id,
                 "tick": int(runs[run].run.scan_ticks[found.centre]),
                 "range": _metres(found.range_m),
+                "read": found.read,  # false: driven by without a read
             }
             for run, found in passes
         ],

@@ -32,6 +32,7 @@ class Pass:
     x: float  # of the centre [m], in the frame of the poses
     y: float
     range_m: float  # how far from the centre the tag was still read; half a chord, so short where the drive turned
+    read: bool = True  # False: the vehicle drove by and read nothing, as the map shows
 
 
 def find_passes(

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.errors import BadInputError
@@ -83,9 +84,9 @@ def _build(args: argparse.Namespace) -> None:
     profile = load_profile(args.profile) if args.profile else None
     atlas = build(args.recordings, profile, Config(args.method, args.assembly, args.matcher), args.jobs)
     write_atlas(args.output, atlas)
-    for remark in atlas.document["remarks"]:
-        print(f"rtlog-atlas: {remark}", file=sys.stderr)
     document = atlas.document
+    for line in [*map(_left_out, document["left_out"]), *document["remarks"]]:
+        print(f"rtlog-atlas: {line}", file=sys.stderr)
     summary = {
         "atlas": str(args.output),
         "runs": len(document["runs"]),
@@ -112,15 +113,21 @@ def _info(args: argparse.Namespace) -> None:
         print(f"run   {run['id']}: {run['ticks']} ticks, profile {run['profile']}")
     for node in document["nodes"]:
         place = f"({node['x']:.2f}, {node['y']:.2f}) m"
-        reach = f"read within {node['range']:.1f} m, {len(node['passes'])} passes"
+        unread = sum(not each["read"] for each in node["passes"])
+        reach = f"read within {node['range']:.1f} m, {len(node['passes'])} passes" + f", {unread} unread" * (unread > 0)
         print(f"node  {node['id']}: {node['epc']} at {place}, {reach}")
     for edge in document["edges"]:
         length = "" if edge["length"] is None else f", {edge['length']:.2f} m"
         print(
             f"{edge['kind']:5} {edge['id']}: {len(edge['paths'])} paths{length}, {edge['links']['strong']} strong links"
         )
-    for remark in document["remarks"]:
-        print(f"note  {remark}")
+    for line in [*map(_left_out, document["left_out"]), *document["remarks"]]:
+        print(f"note  {line}")
+
+
+def _left_out(item: dict[str, Any]) -> str:
+    ticks = ", ".join(map(str, item["ticks"]))
+    return f"{item['what']} is left out of run {item['run']}, ticks {ticks}: {item['reason']}"
 
 
 def _compare(args: argparse.Namespace) -> None:

@@ -112,6 +112,11 @@ def drift_suffix(number: int) -> str:
     return ascii_lowercase[number] if number < 26 else f"z{number - 24}"
 
 
+def rename(parts: list[SolvedPiece], name: str) -> list[SolvedPiece]:
+    """The drifts of one piece under another name."""
+    return [replace(of, input=replace(of.input, name=name + drift_suffix(k))) for k, of in enumerate(parts)]
+
+
 def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:
     return [SolvedPiece(part, map_piece(list(part.paths), part.mount, match)) for part in split_drifts(given)]
 

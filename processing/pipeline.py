@@ -2,6 +2,7 @@
 
 recordings ─ read_log ─ open_loop ─ beacons ─┐
                                              graph ─ pieces (edge_map) ─ assembly ─ grids ─ Atlas
+                                               └─────── tags missed ◄───────┘
 """
 
 from collections import Counter
@@ -17,7 +18,7 @@ from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile
 from processing.atlas import Atlas
 from processing.atlas_document import assemble_atlas
-from processing.beacons import Pass, find_passes, overlapping_passes
+from processing.beacons import Pass, find_passes
 from processing.calibration import WheelScale, calibrate
 from processing.edge_placement import Placed, Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
@@ -25,17 +26,20 @@ from processing.length_placement import place_by_lengths
 from processing.occupancy_grid import Grid
 from processing.odometry import dead_reckon
 from processing.open_loop import OpenLoop, estimate_open_loop, mount_pose, odometry_at_scans
-from processing.pieces import PieceInput, cut_span, draw_piece, solve_piece
+from processing.pieces import PieceInput, SolvedPiece, cut_span, draw_piece, rename, solve_piece
 from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
+from processing.remarks import remarks
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, Scan, match_scans
+from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers
 from rtlog_client.log_file import read_info
 
 Array = NDArray[np.float64]
 
 MIN_SCANS = 10  # a second
+MAX_REVIEWS = 2  # a pass that was not read may only show when another one has been put in
 
 
 def match_polar_scans(reference: Scan, current: Scan, guess: Array) -> ScanMatch:
@@ -71,13 +75,31 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, jobs:
     match = MATCHERS[config.matcher]
     with Workers(jobs) as work:
         runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
-        graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
-        inputs = [piece_input(name, piece, runs) for name, piece in zip(piece_names(graph), graph.pieces, strict=True)]
-        solved = [part for parts in work.map("pieces", partial(solve_piece, match=match), inputs) for part in parts]
-        place = place_by_frames if config.assembly == "refined" else place_by_lengths
-        placed = place(solved, graph, match)
+        runs, left_out = leave_out_moved(runs)
+        runs, graph, placed = map_network(runs, work, match, config)
         grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
-    return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed))
+    return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed), left_out)
+
+
+def map_network(
+    runs: list[DrivenRun], work: Workers, match: Matcher, config: Config
+) -> tuple[list[DrivenRun], Graph, Placement]:
+    """Solve the pieces and assemble them; again, as far as they changed, where the map shows passes without a read."""
+    place = place_by_frames if config.assembly == "refined" else place_by_lengths
+    known: dict[Piece, list[SolvedPiece]] = {}
+    for review in range(MAX_REVIEWS + 1):
+        graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
+        names = dict(zip(graph.pieces, piece_names(graph), strict=True))
+        new = [piece for piece in graph.pieces if piece not in known]
+        inputs = [piece_input(names[piece], piece, runs) for piece in new]
+        known |= dict(zip(new, work.map("pieces", partial(solve_piece, match=match), inputs), strict=True))
+        solved = [part for piece in graph.pieces for part in rename(known[piece], names[piece])]
+        placed = place(solved, graph, match)
+        reviewed = add_missed(runs, placed, match)
+        if reviewed is None or review == MAX_REVIEWS:
+            break
+        runs = reviewed
+    return runs, graph, placed
 
 
 def drive_through(recording: Path, profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
@@ -122,21 +144,6 @@ def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
 
 def draw_placed(placed: Placed, resolution_m: float) -> Grid:
     return draw_piece(placed.solved.input, placed.solved.map.firsts, placed.edge_poses, resolution_m)
-
-
-def remarks(runs: list[DrivenRun], placed: Placement) -> list[str]:
-    """What the user should know about this atlas, a line each."""
-    out = []
-    for driven in runs:
-        tags = len({found.epc for found in driven.passes})
-        if tags < 2:
-            out.append(f"run {driven.run.run_id} passed {tags} tag{'s' * (tags != 1)}: it is mapped alone")
-        for a, b in sorted({tuple(sorted((a.epc, b.epc))) for a, b in overlapping_passes(driven.passes)}):
-            out.append(f"run {driven.run.run_id}: the read clouds of {a} and {b} overlap")
-        lost = int((~driven.loop.matched[1:]).sum())
-        if lost:
-            out.append(f"run {driven.run.run_id}: {lost} of {len(driven.loop.matched)} scans follow odometry alone")
-    return out + placed.remarks
 
 
 def _check_run_ids(recordings: list[Path]) -> None:

@@ -137,6 +137,7 @@ def simulate_reads(
     readings = []
     for tag, place in zip(tags, places, strict=True):
         within = np.linalg.norm(position - place, axis=1) <= tag.read_range_m
+        within &= (rounds >= tag.from_s) & (rounds <= tag.until_s)
         passes = np.cumsum(np.diff(within, prepend=False) & within)  # numbers the stays within the range from 1
         missed = generator.random(passes[-1] + 1) < missed_pass_probability
         read = within & ~missed[passes] & (generator.random(len(rounds)) < tag.read_probability)

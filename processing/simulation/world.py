@@ -11,6 +11,7 @@ In: a small TOML. Out: a `World`. Lengths in metres, coordinates as [x, y] in th
     [noise]                        what the sensors get wrong; `profile` names what they are and how they are mounted
 """
 
+import math
 from collections.abc import Iterator
 from itertools import pairwise, product
 from pathlib import Path
@@ -57,11 +58,15 @@ class Pillar(Record, frozen=True):
 
 
 class Tag(Record, frozen=True):
+    """A tag at a place. One EPC at several is a clone, or with `unread_by` and the times a tag that is moved."""
+
     epc: Annotated[str, Meta(pattern="^[0-9A-F]{24}$")]
     at: Place
     read_range_m: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
     read_probability: Probability = 0.6  # of one inventory round within the range; outside it is zero
     unread_by: list[str] = field(default_factory=list)  # runs that never read it
+    from_s: Annotated[float, Meta(ge=0.0)] = 0.0  # of each run: when the tag is put there
+    until_s: float = math.inf  # and taken away
 
 
 class Driving(Record, frozen=True):
@@ -184,9 +189,9 @@ def _stretch(points: list[Place], start: Place, end: Place) -> list[Place] | Non
 
 def _problems(world: World, profile: Profile) -> Iterator[str]:
     """What the types cannot say."""
-    for kind, names in (("runs", [run.name for run in world.runs]), ("tags", [tag.epc for tag in world.tags])):
-        if len(set(names)) != len(names):
-            yield f"two {kind} share a name: {', '.join(names)}"
+    names = [run.name for run in world.runs]
+    if len(set(names)) != len(names):
+        yield f"two runs share a name: {', '.join(names)}"
     for where, place in _named_places(world):
         if place not in world.places:
             yield f"{where}: there is no {place!r} in [places]"

@@ -205,7 +205,7 @@ def test_atlas_json_has_what_the_contract_says(small_atlas: Path, small_world: P
     for node in document["nodes"]:
         assert all(isinstance(node[key], float) for key in ("x", "y", "theta", "range"))
         assert node["passes"]
-        assert {key for each in node["passes"] for key in each} == {"run", "tick", "range"}
+        assert {key for each in node["passes"] for key in each} == {"run", "tick", "range", "read"}
     assert {(edge["i"], edge["j"]) for edge in document["edges"]} == {
         *((0, 1), (1, 2), (2, 3), (0, 3)),
         *((0, None), (1, None)),

@@ -103,5 +103,5 @@ def test_without_noise_only_the_sensors_change() -> None:
 
 
 def test_every_shipped_world_is_sound() -> None:
-    assert shipped_worlds() == ["demo", "loop", "mine_level", "missed_tag", "straight", "tunnels", "two_drifts"]
+    assert {"demo", "loop", "mine_level", "missed_tag", "moved_tags", "straight", "tunnels"} < set(shipped_worlds())
     assert all(load_world(name).name == name for name in shipped_worlds())

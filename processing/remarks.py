@@ -1,0 +1,55 @@
+"""What the user should know about an atlas, a line each: what was driven by, what stays alone, what could not be seen.
+
+In: the runs as they were mapped, and where their pieces lie. Out: lines for `build`, `info` and atlas.json.
+"""
+
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+from processing.beacons import Pass, overlapping_passes
+from processing.edge_placement import Placement
+
+if TYPE_CHECKING:
+    from processing.pipeline import DrivenRun
+
+
+def remarks(runs: list["DrivenRun"], placed: Placement) -> list[str]:
+    out = []
+    for driven in runs:
+        name = driven.run.run_id
+        for found in driven.passes:
+            if not found.read:
+                tick = int(driven.run.scan_ticks[found.centre])
+                out.append(f"run {name} drove by {found.epc} at tick {tick} without reading it; it is cut there")
+        out += [f"run {name}: the read clouds of {a} and {b} overlap" for a, b in _overlaps(driven.passes)]
+        lost = int((~driven.loop.matched[1:]).sum())
+        if lost:
+            out.append(f"run {name}: {lost} of {len(driven.loop.matched)} scans follow odometry alone")
+    return out + placed.remarks + _remark_parts(runs, placed)
+
+
+def _overlaps(passes: list[Pass]) -> list[tuple[str, str]]:
+    pairs = overlapping_passes([found for found in passes if found.read])
+    return sorted({(min(a.epc, b.epc), max(a.epc, b.epc)) for a, b in pairs})
+
+
+def _remark_parts(runs: list["DrivenRun"], placed: Placement) -> list[str]:
+    """Which runs hang together by little or by nothing."""
+    of_run = {span.run: piece.part for piece in placed.pieces for span in piece.solved.input.piece.spans}
+    members = defaultdict(list)
+    for number, driven in enumerate(runs):
+        members[of_run[number]].append(driven.run.run_id)
+    out = []
+    for number, driven in enumerate(runs):
+        tags, alone = len({found.epc for found in driven.passes}), len(members[of_run[number]]) == 1
+        if alone and (tags < 2 or len(runs) > 1):
+            shares = f"passed {tags} tag{'s' * (tags != 1)}" if tags < 2 else "shares no tag with the others"
+            out.append(f"run {driven.run.run_id} {shares}: it is mapped alone")
+        elif tags < 2:
+            out.append(
+                f"run {driven.run.run_id} passed 1 tag: that alone, and the walls around it, join it to the others"
+            )
+    if len(members) > 1:
+        names = "; ".join(", ".join(of) for _, of in sorted(members.items()))
+        out.append(f"runs of each part: {names}")
+    return out

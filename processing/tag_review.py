@@ -1,0 +1,76 @@
+"""What the tags say, reviewed: tags that are not at one place are left out, passes that were not read are put in.
+
+In: driven runs, before and after they are mapped. Out: the same runs with other passes, and what was left out and why,
+as it stands in atlas.json.
+"""
+
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from processing.edge_placement import Placement
+from processing.missed_tags import MappedRun, add_passes, find_missed
+from processing.moved_tags import OpenPasses, PassId, find_moved
+from processing.open_loop import mount_pose
+from processing.registration import SEEN_M, register_passes
+from processing.scan_matching import Matcher, Scan
+from processing.trajectory import keyframe_poses
+
+if TYPE_CHECKING:
+    from processing.pipeline import DrivenRun
+
+
+def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[dict[str, Any]]]:
+    """The runs without the passes of tags that were moved or stand at two places, and what to tell of these."""
+
+    def scan_of(of: PassId) -> Scan:
+        loop = runs[of[0]].loop
+        return loop.scans[int(np.searchsorted(loop.keyframes, runs[of[0]].passes[of[1]].centre))]
+
+    @cache
+    def same_walls(first: PassId, second: PassId) -> bool:
+        found = register_passes(scan_of(first), scan_of(second), mount_pose(runs[first[0]].run))
+        return found is not None and bool(np.linalg.eigvalsh(found.covariance[:2, :2])[-1] < SEEN_M**2)
+
+    moved = find_moved([_open_passes(run) for run in runs], same_walls)
+    left_out = [
+        {
+            "what": f"tag {epc}",
+            "run": run.run.run_id,
+            "ticks": [int(run.run.scan_ticks[found.centre]) for found in run.passes if found.epc == epc],
+            "reason": "it was read at more than one place: moved, or two tags of one EPC",
+        }
+        for epc in moved
+        for run in runs
+        if any(found.epc == epc for found in run.passes)
+    ]
+    return [replace(run, passes=[found for found in run.passes if found.epc not in moved]) for run in runs], left_out
+
+
+def _open_passes(driven: "DrivenRun") -> OpenPasses:
+    poses = driven.loop.keyframe_poses
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    at = np.searchsorted(driven.loop.keyframes, [found.centre for found in driven.passes]).astype(int)
+    return OpenPasses(driven.passes, poses[at, :2], way[at])
+
+
+def add_missed(runs: list["DrivenRun"], placed: Placement, match: Matcher) -> list["DrivenRun"] | None:
+    """The runs with the passes that they made without reading the tag; None where there is none to be added."""
+    parts = {span.run: piece.part for piece in placed.pieces for span in piece.solved.input.piece.spans}
+    mapped = [
+        MappedRun(
+            run.passes,
+            run.loop.keyframes,
+            keyframe_poses(placed.pieces, number, len(run.loop.keyframes)),
+            run.loop.scans,
+            parts[number],
+            mount_pose(run.run),
+        )
+        for number, run in enumerate(runs)
+    ]
+    passes = [add_passes(run.passes, missed) for run, missed in zip(runs, find_missed(mapped, match), strict=True)]
+    if all(len(run.passes) == len(of) for run, of in zip(runs, passes, strict=True)):
+        return None
+    return [replace(run, passes=of) for run, of in zip(runs, passes, strict=True)]
