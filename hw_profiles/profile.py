@@ -11,6 +11,7 @@ needs on top, and are checked with the rest. Lengths in metres, angles in degree
               right wheel
 """
 
+import ipaddress
 import math
 import re
 from collections.abc import Iterator
@@ -75,7 +76,7 @@ class Encoder(Record, frozen=True):
     wheel_radius_m: float | None = None
     zero_deg: float = 0.0  # steering: the encoder's reading when the wheel points straight ahead
     reversed: bool = False  # counts fall when the vehicle drives ahead, or steers to the left
-    address: int | None = None  # on the bus: SEI address 0…14
+    address: int | None = None  # on the bus: SEI address 0…14, CAN node id 1…127
 
 
 class SeiBus(Record, frozen=True, tag_field="kind", tag="sei"):
@@ -85,15 +86,47 @@ class SeiBus(Record, frozen=True, tag_field="kind", tag="sei"):
     baud: Literal[9600, 115200] = 9600
     echo: Literal["auto", "yes", "no"] = "auto"  # does the adapter return every byte that is sent?
     turns: Literal["single", "multi"] = "single"
+    strobe: bool = False  # encoders were put into strobe mode by US Digital's software: all latch at our strobe
+
+    @property
+    def place(self) -> str:
+        """Where the bus is reached."""
+        return self.port
+
+
+class CanBus(Record, frozen=True, tag_field="kind", tag="can"):
+    """CiA 406 (CANopen) encoders on one CAN bus; their addresses are node ids."""
+
+    channel: str  # socketcan: network interface; slcan: serial port; udp_multicast: group; virtual: any name
+    interface: Literal["socketcan", "slcan", "udp_multicast", "virtual"] = "socketcan"
+    bitrate: Literal[10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 1_000_000] = 500_000  # socketcan: set outside
+    udp_port: int = 43113
+    trigger: Literal["sync", "timer"] = "sync"  # positions latched at our SYNC, or sent by the encoders' own clocks
+    timer_ms: int = 10  # of trigger = "timer"
+    vendor_id: int | None = None  # of all encoders (object 1018h:1); None: any
+
+    @property
+    def place(self) -> str:
+        """Where the bus is reached."""
+        return f"{self.interface}:{self.channel}"
 
 
 class RfidDevice(Record, frozen=True):
-    host: str
+    """The reader's console: on the network (`host`), or on a serial line (`serial_port`), which asks for no login."""
+
+    host: str = ""
     port: int = 23
+    serial_port: str = ""
+    baud: Literal[9600, 19200, 38400, 57600, 115200] = 115200
     username: str = "alien"
     password: str = "password"
     stream_host: str | None = None  # our own address as the reader sees it; None: the one the console was opened from
     stream_port: int = 0  # the reader connects back to this port; 0 takes any
+
+    @property
+    def place(self) -> str:
+        """Where the console is reached."""
+        return self.serial_port or f"{self.host}:{self.port}"
 
 
 class Rfid(Record, frozen=True):
@@ -112,7 +145,7 @@ class Profile(Record, frozen=True):
     vehicle: Vehicle | None = None
     lasers: Lasers = Lasers()
     encoders: list[Encoder] = field(default_factory=list)
-    encoder_bus: SeiBus | None = None
+    encoder_bus: SeiBus | CanBus | None = None
     rfid: Rfid | None = None
     zenoh: Zenoh = Zenoh()
 
@@ -187,10 +220,37 @@ def _problems(profile: Profile) -> Iterator[str]:
             yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; it must be 2 or more"
         if encoder.role != "steering" and not (encoder.wheel_radius_m or 0) > 0:
             yield f"{where}.wheel_radius_m is {encoder.wheel_radius_m}; a wheel needs it above 0"
-        if profile.encoder_bus is not None and not 0 <= (encoder.address if encoder.address is not None else -1) <= 14:
-            yield f"{where}.address is {encoder.address}; an encoder on an SEI bus has one in 0 … 14"
-        if profile.encoder_bus is not None and encoder.counts_per_turn > 65536:
-            yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; on an SEI bus it is 65536 or less"
-    addresses = [encoder.address for encoder in profile.encoders if profile.encoder_bus is not None]
+    reader = profile.rfid.device if profile.rfid is not None else None
+    if reader is not None and bool(reader.host) == bool(reader.serial_port):
+        yield f"rfid.device.host is {reader.host!r} and serial_port {reader.serial_port!r}; it must be one of the two"
+    if profile.encoder_bus is not None:
+        yield from _bus_problems(profile.encoder_bus, profile.encoders)
+
+
+def _bus_problems(bus: SeiBus | CanBus, encoders: list[Encoder]) -> Iterator[str]:
+    """What makes the encoders none that this bus can have, or the bus none that can be opened."""
+    kind, first, last = ("an SEI bus", 0, 14) if isinstance(bus, SeiBus) else ("a CAN bus", 1, 127)
+    for index, encoder in enumerate(encoders):
+        if encoder.address is None or not first <= encoder.address <= last:
+            yield f"encoders[{index}].address is {encoder.address}; an encoder on {kind} has one in {first} … {last}"
+        if isinstance(bus, SeiBus) and encoder.counts_per_turn > 65536:
+            yield f"encoders[{index}].counts_per_turn is {encoder.counts_per_turn}; on an SEI bus it is 65536 or less"
+    addresses = [encoder.address for encoder in encoders]
     if len(set(addresses)) != len(addresses):
         yield f"encoders share an address on the bus: {addresses}"
+    if isinstance(bus, CanBus):
+        if not 1 <= bus.timer_ms <= 1000:
+            yield f"encoder_bus.timer_ms is {bus.timer_ms}; it must lie in 1 … 1000"
+        if not 1 <= bus.udp_port <= 65535:
+            yield f"encoder_bus.udp_port is {bus.udp_port}; it must lie in 1 … 65535"
+        if bus.interface == "udp_multicast" and not _is_multicast(bus.channel):
+            yield f"encoder_bus.channel is {bus.channel!r}; udp_multicast needs a group such as 239.74.163.2"
+        if not bus.channel:
+            yield "encoder_bus.channel is empty"
+
+
+def _is_multicast(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_multicast
+    except ValueError:
+        return False

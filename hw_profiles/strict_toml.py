@@ -43,7 +43,7 @@ def parse_toml(text: str, kind: type[RecordT], what: str) -> RecordT:
 def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str, list[str]]]:
     """Each key of `raw` that the record `expected` lacks, with its path, and the keys known there."""
     if isinstance(expected, types.UnionType):
-        expected = typing.get_args(expected)[0]
+        expected = _meant_member(expected, raw)
     if isinstance(raw, list) and typing.get_origin(expected) is list:
         for index, item in enumerate(raw):
             yield from _unknown_keys(item, typing.get_args(expected)[0], f"{where}[{index}]")
@@ -58,6 +58,16 @@ def _unknown_keys(raw: object, expected: Any, where: str) -> Iterator[tuple[str,
             yield from _unknown_keys(value, hints[key], path)
         elif key != tag_field:
             yield path, known
+
+
+def _meant_member(union: types.UnionType, raw: object) -> Any:
+    """The record of the union that the tag in `raw` names; the first, where no tag tells."""
+    members = typing.get_args(union)
+    for member in members:
+        config = getattr(member, "__struct_config__", None)
+        if isinstance(raw, dict) and config is not None and config.tag and raw.get(config.tag_field) == config.tag:
+            return member
+    return members[0]
 
 
 def _unreal_numbers(raw: object, where: str) -> Iterator[str]:

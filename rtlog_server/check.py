@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from hw_profiles.profile import Profile
+from hw_profiles.profile import CanBus, Profile, SeiBus
 from rtlog_server.devices import open_devices
 from rtlog_server.devices.device import Device, TickGrid
 
@@ -68,9 +68,17 @@ def _whereabouts(profile: Profile) -> dict[str, tuple[str, str]]:
             host, port = laser.device.host, laser.device.port
             places[f"laser/{name}"] = (f"{host}:{port}", f"power, cable; ping {host}; CoLa port {port} (2111 or 2112)")
     if profile.encoder_bus is not None:
-        port_name = profile.encoder_bus.port
-        places["encoders"] = (port_name, f"adapter, encoders' power, addresses; ls -l {port_name}; group dialout")
+        places["encoders"] = (profile.encoder_bus.place, _encoder_advice(profile.encoder_bus))
     if profile.rfid is not None and profile.rfid.device is not None:
         host, port = profile.rfid.device.host, profile.rfid.device.port
         places["rfid"] = (f"{host}:{port}", f"power, cable; ping {host}; telnet {host} {port}; user and password")
     return places
+
+
+def _encoder_advice(bus: SeiBus | CanBus) -> str:
+    if isinstance(bus, SeiBus):
+        return f"adapter, encoders' power, addresses; ls -l {bus.port}; group dialout"
+    wiring = "encoders' power, node ids, terminators, bit rate"
+    if bus.interface == "socketcan":
+        return f"{wiring}; ip -details link show {bus.channel}"
+    return f"{wiring}; ls -l {bus.channel}; group dialout" if bus.interface == "slcan" else wiring

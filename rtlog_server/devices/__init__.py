@@ -3,9 +3,10 @@
 from typing import Any
 
 from hw_profiles.errors import BadInputError
-from hw_profiles.profile import Profile
+from hw_profiles.profile import CanBus, Encoder, Profile, SeiBus
 from rtlog_server.devices.alien.driver import Alr9650
 from rtlog_server.devices.device import Device
+from rtlog_server.devices.encoders import EncoderReading
 from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.sei.driver import SeiEncoders
 
@@ -25,12 +26,20 @@ def open_devices(profile: Profile) -> list[Device[Any]]:
     if profile.encoders:
         if profile.encoder_bus is None:
             raise _lacks(profile, "[encoder_bus] with the encoders' port")
-        devices.append(SeiEncoders("encoders", profile.encoder_bus, profile.encoders))
+        devices.append(_open_encoders(profile.encoder_bus, profile.encoders))
     if profile.rfid is not None:
         if profile.rfid.device is None:
             raise _lacks(profile, "[rfid.device] with the reader's host")
         devices.append(Alr9650("rfid", profile.rfid.device))
     return devices
+
+
+def _open_encoders(bus: SeiBus | CanBus, encoders: list[Encoder]) -> Device[EncoderReading]:
+    if isinstance(bus, SeiBus):
+        return SeiEncoders("encoders", bus, encoders)
+    from rtlog_server.devices.cia406.driver import Cia406Encoders  # here: python-can and canopen take 0.15 s to load
+
+    return Cia406Encoders("encoders", bus, encoders)
 
 
 def _lacks(profile: Profile, section: str) -> BadInputError:
