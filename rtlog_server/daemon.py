@@ -10,14 +10,14 @@ does not keep up costs counted ticks, and one that died ends the server (systemd
 import faulthandler
 import gc
 import logging
-import multiprocessing
 import signal
+import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Pipe
 from typing import Any
 
 from hw_profiles.errors import RTLogError
@@ -116,17 +116,15 @@ class PublishingProcess:
     """The other process, and the outbox to it."""
 
     def __init__(self, info: ServerInfo) -> None:
-        context = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_publish, args=(theirs, info), name="publish", daemon=True)
+        self._connection, theirs = Pipe()
+        command = [sys.executable, "-m", "rtlog_server.publish", str(theirs.fileno())]
         # Ctrl-C and systemd signal both processes, but the publisher must outlive the last tick: it inherits a mask
-        # that blocks them for good, and ends when the pipe does. (The tracker of multiprocessing, if it were started
-        # by `start`, would undo the mask.)
-        resource_tracker.ensure_running()
+        # that blocks them for good, and ends when the pipe does.
         previous = signal.pthread_sigmask(signal.SIG_BLOCK, END_SIGNALS)
-        self._process.start()
+        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()])
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
         theirs.close()
+        self._connection.send(info)
         self.outbox = Outbox(self._connection, QUEUE_TICKS)
 
     def came_up(self) -> bool:
@@ -140,8 +138,7 @@ class PublishingProcess:
         try:
             failure = self._connection.recv()
         except (EOFError, ConnectionResetError):
-            self._process.join()
-            failure = f"the publishing process ended (exit status {self._process.exitcode})"
+            failure = f"the publishing process ended (exit status {self._process.wait()})"
         if failure:
             raise RTLogError(failure)
         return True
@@ -149,14 +146,9 @@ class PublishingProcess:
     def close(self) -> None:
         """Let everything that was queued go out. Raises: RTLogError: it would not."""
         drained = self.outbox.close(CLOSE_PUBLISHER_S)
-        if drained:
-            self._process.join(CLOSE_PUBLISHER_S)
-        if self._process.exitcode is None:
+        try:
+            self._process.wait(CLOSE_PUBLISHER_S if drained else 0.0)
+        except subprocess.TimeoutExpired as error:
             self._process.kill()
-            raise RTLogError(f"the publishing process did not take the last ticks within {CLOSE_PUBLISHER_S:.0f} s")
-
-
-def _publish(connection: Connection, info: ServerInfo) -> None:
-    from rtlog_server.publish import publish_bundles  # here, so that zenoh is loaded in this process alone
-
-    publish_bundles(connection, info)
+            message = f"the publishing process did not take the last ticks within {CLOSE_PUBLISHER_S:.0f} s"
+            raise RTLogError(message) from error

@@ -10,6 +10,7 @@ it. (Blocking puts stand still for seconds when a link is down, and then close i
 """
 
 import json
+import sys
 import threading
 import time
 from collections import Counter
@@ -33,7 +34,7 @@ WAIT_BEFORE_DROP_US = 5000
 
 
 def publish_bundles(connection: Connection, info: ServerInfo) -> None:
-    """The main function of the publishing process: returns when the other end of the pipe is closed or its owner died.
+    """Publish what comes; returns when the other end of the pipe is closed or its owner died.
 
     Sends "" when the session is open, or one line that says why zenoh failed, and then returns.
     """
@@ -142,3 +143,17 @@ class Publisher:
     def __exit__(self, *_: object) -> None:
         self.heartbeat()
         self._session.close()
+
+
+def main() -> None:
+    """The publishing process: its argument is the number of the pipe, whose first item is a ServerInfo."""
+    connection = Connection(int(sys.argv[1]))
+    try:
+        info = connection.recv()
+    except EOFError:
+        return  # the server is gone already
+    publish_bundles(connection, info)
+
+
+if __name__ == "__main__":
+    main()

@@ -44,8 +44,8 @@ def usage(process: int) -> Usage:
 
 def processes(server: int) -> dict[str, int]:
     """Of the server, by what they do."""
-    children = Path(f"/proc/{server}/task/{server}/children").read_text().split()
-    return {"sampling": server} | {f"child {k}": int(child) for k, child in enumerate(children)}
+    (publisher,) = Path(f"/proc/{server}/task/{server}/children").read_text().split()
+    return {"sampling": server, "publishing": int(publisher)}
 
 
 def measure(profile: Path, seconds: float) -> dict[str, float]:

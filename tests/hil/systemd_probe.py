@@ -1,7 +1,7 @@
 """Runs as root inside the container that test_systemd.py boots: puts the unit through its life and writes what it saw.
 
-Out: /report/report.json, a dict; what goes wrong on the way is in /report/journal.txt. It takes nothing but the standard
-library.
+Out: /report/report.json, a dict; what goes wrong on the way is in /report/journal.txt. It takes nothing but the
+standard library.
 """
 
 import ctypes
