@@ -29,12 +29,12 @@ from processing.open_loop import OpenLoop, estimate_open_loop, mount_pose, odome
 from processing.pieces import PieceInput, SolvedPiece, cut_span, draw_piece, rename, solve_piece
 from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
+from processing.recordings import group_parts
 from processing.remarks import remarks
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, Scan, match_scans
 from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers
-from rtlog_client.log_file import read_info
 
 Array = NDArray[np.float64]
 
@@ -70,11 +70,11 @@ class DrivenRun:
 
 
 def build(recordings: list[Path], profile: Profile | None, config: Config, jobs: int = 1) -> Atlas:
-    """Map recordings. Raises: BadInputError: a recording is unfit, or two of them are the same run."""
-    _check_run_ids(recordings)
+    """Map recordings. Raises: BadInputError: a recording is unfit, or it cannot be told which run it is."""
+    parts = group_parts(recordings)
     match = MATCHERS[config.matcher]
     with Workers(jobs) as work:
-        runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), recordings)
+        runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), parts)
         runs, left_out = leave_out_moved(runs)
         runs, graph, placed = map_network(runs, work, match, config)
         grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
@@ -102,11 +102,11 @@ def map_network(
     return runs, graph, placed
 
 
-def drive_through(recording: Path, profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
-    """Read one recording, find its passes and estimate it open loop."""
-    run = read_log(recording, profile)
+def drive_through(recording: tuple[Path, ...], profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
+    """Read the parts of one recording, find its passes and estimate it open loop."""
+    run = read_log(recording[0], profile, recording[1:])
     if len(run.scans.times) < MIN_SCANS:
-        raise BadInputError(f"{recording}: {len(run.scans.times)} scans are too few to map")
+        raise BadInputError(f"{recording[0]}: {len(run.scans.times)} scans are too few to map")
     run, wheels = calibrate(run)
     driven = dead_reckon(odometry_at_scans(run))
     passes: list[Pass] = []
@@ -144,15 +144,3 @@ def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
 
 def draw_placed(placed: Placed, resolution_m: float) -> Grid:
     return draw_piece(placed.solved.input, placed.solved.map.firsts, placed.edge_poses, resolution_m)
-
-
-def _check_run_ids(recordings: list[Path]) -> None:
-    """Before any work, so that a slip of the hand is told at once."""
-    seen: dict[str, Path] = {}
-    for path in recordings:
-        run_id = read_info(path).run_id
-        if run_id in ("", ".", "..") or "/" in run_id:
-            raise BadInputError(f"{path}: the run is called {run_id!r}, which no file can be")
-        if run_id in seen:
-            raise BadInputError(f"{seen[run_id]} and {path} are the same run, {run_id}")
-        seen[run_id] = path

@@ -9,8 +9,9 @@ order that is true.
 
 import hashlib
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,14 +74,14 @@ class Run:
     ticks: int
 
 
-def read_log(path: Path, profile: Profile | None = None) -> Run:
-    """Read a recording; `profile` stands in for a missing attachment.
+def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path] = ()) -> Run:
+    """Read a recording; `profile` stands in for a missing attachment, `further` are the parts of it that follow.
 
     Raises:
         BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders, or messages that
             are not what their topics say.
     """
-    info = read_info(path)
+    info = _join([read_info(part) for part in (path, *further)])
     profile = _profile(path, info, profile)
     scan_topic = next((topic for topic in SCAN_TOPICS if info.message_counts.get(topic)), None)
     if scan_topic is None:
@@ -101,7 +102,7 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     wheels = _wheels_of(profile) if encoder_topic == JOINT_STATES.name else _pose_of
     tick_log_times: list[int] = []
     scan_log_times: list[int] = []
-    for topic, log_time_ns, message in _decoded(path, [TICK.name, scan_topic, encoder_topic, TAGS.name]):
+    for topic, log_time_ns, message in _decoded((path, *further), [TICK.name, scan_topic, encoder_topic, TAGS.name]):
         if topic == TICK.name:
             tick_log_times.append(log_time_ns)
         elif topic == scan_topic:
@@ -127,12 +128,10 @@ def read_log(path: Path, profile: Profile | None = None) -> Run:
     motion_times = np.asarray((rising_motion_ns - epoch_ns) * 1e-9, np.float64)
     scan_times = np.asarray((rising_scan_ns - epoch_ns) * 1e-9, np.float64)
     _take_over_times(scan_ns, scan_times, motion_ns, motion_times)
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     have_wheels = encoder_topic == JOINT_STATES.name
     return Run(
         run_id=info.run_id,
-        sha256=sha256,
+        sha256=_digest((path, *further)),
         profile=profile,
         scans=_stack_scans(path, scans, scan_ns, scan_times),
         scan_ticks=(
@@ -209,13 +208,33 @@ def _profile(path: Path, info: LogInfo, fallback: Profile | None) -> Profile:
     return BARE_PROFILE
 
 
-def _decoded(path: Path, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
-    for message in read_messages(path, topics):
-        try:
-            inside = None if message.topic == TICK.name else decode(message.data, message.msgtype)
-            yield message.topic, message.log_time_ns, inside
-        except (ValueError, KeyError) as error:
-            raise BadInputError(f"{path}: {message.topic} at {message.log_time_ns} ns: {error}") from error
+def _join(parts: list[LogInfo]) -> LogInfo:
+    """What the parts of a recording say together."""
+    counts = Counter[str]()
+    for part in parts:
+        counts.update(part.message_counts)
+    types = {topic: msgtype for part in parts for topic, msgtype in part.msgtypes.items()}
+    return replace(parts[0], message_counts=dict(counts), msgtypes=types)
+
+
+def _digest(paths: Sequence[Path]) -> str:
+    """SHA-256 of the file; of several parts, of all of them in order."""
+    found = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                found.update(block)
+    return found.hexdigest()
+
+
+def _decoded(paths: Sequence[Path], topics: list[str]) -> Iterator[tuple[str, int, Any]]:
+    for path in paths:
+        for message in read_messages(path, topics):
+            try:
+                inside = None if message.topic == TICK.name else decode(message.data, message.msgtype)
+                yield message.topic, message.log_time_ns, inside
+            except (ValueError, KeyError) as error:
+                raise BadInputError(f"{path}: {message.topic} at {message.log_time_ns} ns: {error}") from error
 
 
 def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:

@@ -88,7 +88,7 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def drive_both(world: Path) -> list[DrivenRun]:
-    return [drive_through(world / f"small-{run}.mcap", None, match_scans, Config()) for run in ("around", "back")]
+    return [drive_through((world / f"small-{run}.mcap",), None, match_scans, Config()) for run in ("around", "back")]
 
 
 @pytest.fixture(scope="session")
