@@ -7,25 +7,27 @@ no telegram is skipped and counted, nothing else is lost, and never more than on
     CoLa B (binary)    02 02 02 02, payload length (u32, big endian), payload, XOR of the payload's bytes
 
 A binary payload may itself contain 02 02 02 02, so a head is looked for only where a telegram may begin, and after a
-wrong length or checksum the search goes on one byte behind the head that was wrong.
+wrong checksum the search goes on one byte behind the head that was wrong.
 
 Source: SICK Telegram Listing 8014631, §2; captured sessions of an LMS111.
 """
 
 import re
+from collections.abc import Iterator
 from enum import Enum
 
 import numpy as np
 
 from hw_profiles.errors import RTLogError
 
-MAX_PAYLOAD_BYTES = 65536  # the longest of an LMS111, 1,081 points with remission in CoLa A, has about 10,000
+MAX_PAYLOAD_BYTES = 32767  # the longest of an LMS111, two echoes of 1,081 points in CoLa A, has about 22,000
 
 STX, ETX = b"\x02", b"\x03"
 BINARY_HEAD = 4 * STX
 BINARY_HEAD_BYTES = 8  # with the length
-PAYLOAD_START = ord("s")  # of every payload: sRN, sAN, sFA …
 
+TEXT_TELEGRAM = re.compile(rb"\x02(s[^\x02\x03]{2,%d})\x03" % (MAX_PAYLOAD_BYTES - 1))
+BINARY_START = re.compile(rb"\x02{4}\0\0[\0-\x7f][\0-\xff]s")  # a possible length, and every payload begins with s
 COMMAND = re.compile(rb"(s[A-Z]{2}) (\w+)(?: |\Z)", re.ASCII)
 
 
@@ -72,53 +74,41 @@ class Receiver:
 
     def __init__(self, dialect: Dialect) -> None:
         self.skipped_bytes = 0  # garbage and broken telegrams so far
-        self._next_payload = self._next_text if dialect is Dialect.A else self._next_binary
+        self._cut = self._cut_text if dialect is Dialect.A else self._cut_binary
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
         """The payloads that these bytes complete, oldest first."""
         self._buffer += data
-        payloads = []
-        while (payload := self._next_payload()) is not None:
-            payloads.append(payload)
-        return payloads
+        return list(self._cut())
 
     def _skip(self, count: int) -> None:
         self.skipped_bytes += count
         del self._buffer[:count]
 
-    def _next_text(self) -> bytes | None:
-        """The next payload of CoLa A, None if more bytes are needed. A second 02 before the 03 starts anew."""
-        while (end := self._buffer.find(ETX)) >= 0:
-            start = self._buffer.rfind(STX, 0, end)
-            if start < 0:
-                self._skip(end + 1)
-                continue
-            payload = bytes(self._buffer[start + 1 : end])
+    def _cut_text(self) -> Iterator[bytes]:
+        """Whole payloads of CoLa A. A second 02 before the 03 starts anew."""
+        while match := TEXT_TELEGRAM.search(self._buffer):
+            start, end, payload = match.start(), match.end(), match[1]
             self._skip(start)
-            del self._buffer[: end - start + 1]
-            return payload
-        start = self._buffer.rfind(STX)
-        cut = start >= 0 and len(self._buffer) - start <= MAX_PAYLOAD_BYTES
-        self._skip(start if cut else len(self._buffer))
-        return None
+            del self._buffer[: end - start]
+            yield payload
+        start = max(self._buffer.rfind(STX), self._buffer.rfind(ETX))
+        begun = start >= 0 and self._buffer[start : start + 1] == STX and len(self._buffer) - start <= MAX_PAYLOAD_BYTES
+        self._skip(start if begun else len(self._buffer))
 
-    def _next_binary(self) -> bytes | None:
-        """The next payload of CoLa B, None if more bytes are needed."""
-        while (start := self._buffer.find(BINARY_HEAD)) >= 0:
+    def _cut_binary(self) -> Iterator[bytes]:
+        """Whole payloads of CoLa B."""
+        while match := BINARY_START.search(self._buffer):
+            start = match.start()
             self._skip(start)
-            if len(self._buffer) <= BINARY_HEAD_BYTES:
-                return None
-            length = int.from_bytes(self._buffer[4:BINARY_HEAD_BYTES])
-            end = BINARY_HEAD_BYTES + length
-            plausible = 0 < length <= MAX_PAYLOAD_BYTES and self._buffer[BINARY_HEAD_BYTES] == PAYLOAD_START
-            if plausible and len(self._buffer) <= end:
-                return None
-            if plausible:
-                payload = bytes(self._buffer[BINARY_HEAD_BYTES:end])
-                if xor(payload) == self._buffer[end]:
-                    del self._buffer[: end + 1]
-                    return payload
-            self._skip(1)
-        self._skip(max(0, len(self._buffer) - len(BINARY_HEAD) + 1))  # what is left may be the start of a head
-        return None
+            end = BINARY_HEAD_BYTES + int.from_bytes(self._buffer[4:BINARY_HEAD_BYTES])
+            if len(self._buffer) <= end:
+                return
+            payload = bytes(self._buffer[BINARY_HEAD_BYTES:end])
+            if payload and xor(payload) == self._buffer[end]:
+                del self._buffer[: end + 1]
+                yield payload
+            else:
+                self._skip(1)
+        self._skip(max(0, len(self._buffer) - BINARY_HEAD_BYTES))  # what is left may be the start of one

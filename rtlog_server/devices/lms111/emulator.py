@@ -148,9 +148,9 @@ class Lms111Emulator:
         """Forget that the client is registered for scans; go on answering it."""
         self._loop.call(self._forget_registration)
 
-    def drop_connection(self) -> None:
-        """Reset the client's connection."""
-        self._loop.call(self._hang_up, True)
+    def drop_connection(self, reset: bool = True) -> None:
+        """Reset the client's connection, or close it in good order."""
+        self._loop.call(self._hang_up, reset)
 
     def go_silent(self, silent: bool = True) -> None:
         """Say nothing more, as if the cable were pulled; new connections are taken and met with silence."""

@@ -22,7 +22,7 @@ from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.protocol import Command, decode, encode_command, reply_name
 from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
 
-CAPTURES = Path(__file__).parents[3] / "shared" / "data" / "lms111"
+CAPTURES = Path(__file__).parents[4] / "shared" / "data" / "lms111"
 needs_captures = pytest.mark.skipif(not CAPTURES.is_dir(), reason=f"no captured sessions in {CAPTURES}")
 
 SECTOR = (1, 5000, -449997, 2249997)  # as the captured device has it: an earlier driver wrote rounded values

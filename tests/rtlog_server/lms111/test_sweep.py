@@ -13,7 +13,7 @@ from rtlog_server.devices.lms111.protocol import decode
 from rtlog_server.devices.lms111.scan_data import Channel, ScanData
 from rtlog_server.devices.lms111.sweep import first_ray_delay_us, period_us, sweep_us, to_scan
 
-CAPTURES = Path(__file__).parents[3] / "shared" / "data" / "lms111"
+CAPTURES = Path(__file__).parents[4] / "shared" / "data" / "lms111"
 needs_captures = pytest.mark.skipif(not CAPTURES.is_dir(), reason=f"no captured sessions in {CAPTURES}")
 TRANSMITTED_NS = 1_000_000_000_000
 
