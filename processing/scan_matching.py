@@ -48,80 +48,144 @@ class Scan:
     variances: Array  # (B, 2): of the point off its line [m²], of the normal's direction [rad²]
     angle_min: float
     angle_increment: float
+    bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
 
 
 Matcher = Callable[[Scan, Scan, Array], ScanMatch]  # reference, current, first guess (3,)
 
 
 @njit(cache=True)
-def _fit_walls(points: Array, increment: float, normals: Array, variances: Array) -> None:
-    """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are."""
-    count = points.shape[0]
+def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array, variances: Array) -> float:
+    """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are.
+
+    Returns: how far off its beam's bearing a point lies at most [rad].
+    """
+    count, bent = points.shape[0], 0.0
+    for i in range(count):
+        if math.isfinite(points[i, 0]):
+            off = math.atan2(points[i, 1], points[i, 0]) - (angle_min + i * increment)
+            bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
+    joined = np.zeros(count, np.bool_)  # with the next beam: do the two see one wall?
+    for i in range(count - 1):
+        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        reach = math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+        joined[i] = math.sqrt(dx * dx + dy * dy) < max(0.15, GRAZING * increment * reach)  # NaN compares false
     for i in range(count):
         normals[i, 0] = normals[i, 1] = np.nan
         variances[i, 0] = variances[i, 1] = np.nan
-        if not math.isfinite(points[i, 0]):
+        if i == 0 or i == count - 1 or not (joined[i - 1] and joined[i]):
             continue
+        # Grow to both sides, a beam at a time; the moments are those about point i.
+        x0, y0 = points[i, 0], points[i, 1]
         low = high = i
         grow_low = grow_high = True
+        sx = sy = sxx = sxy = syy = 0.0
         while (grow_low or grow_high) and high - low < 2 * MAX_NEIGHBOURS:
             if grow_low:
-                grow_low = low > 0 and _joined(points, low - 1, low, increment) and i - low < MAX_NEIGHBOURS
+                grow_low = low > 0 and joined[low - 1] and i - low < MAX_NEIGHBOURS
                 if grow_low:
                     low -= 1
+                    dx, dy = points[low, 0] - x0, points[low, 1] - y0
+                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
             if grow_high:
-                grow_high = (
-                    high < count - 1 and _joined(points, high, high + 1, increment) and high - i < MAX_NEIGHBOURS
-                )
+                grow_high = high < count - 1 and joined[high] and high - i < MAX_NEIGHBOURS
                 if grow_high:
                     high += 1
-            length = math.hypot(points[high, 0] - points[low, 0], points[high, 1] - points[low, 1])
-            if high - low >= 4 and length > WALL_LENGTH_M:
-                break
+                    dx, dy = points[high, 0] - x0, points[high, 1] - y0
+                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+            if high - low >= 4:
+                dx, dy = points[high, 0] - points[low, 0], points[high, 1] - points[low, 1]
+                if dx * dx + dy * dy > WALL_LENGTH_M * WALL_LENGTH_M:
+                    break
         n = high - low + 1
-        if n < 4 or i - low < 1 or high - i < 1:
+        if n < 4:
             continue
-        mx = my = 0.0
-        for j in range(low, high + 1):
-            mx += points[j, 0]
-            my += points[j, 1]
-        mx /= n
-        my /= n
-        sxx = sxy = syy = 0.0
-        for j in range(low, high + 1):
-            dx, dy = points[j, 0] - mx, points[j, 1] - my
-            sxx += dx * dx
-            sxy += dx * dy
-            syy += dy * dy
-        angle = 0.5 * math.atan2(2 * sxy, sxx - syy)  # of the wall
-        c, s = math.cos(angle), math.sin(angle)
-        along = c * c * sxx + 2 * c * s * sxy + s * s * syy
+        sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+        # The larger eigenvalue of the scatter, and its direction: the wall's.
+        half = 0.5 * (sxx - syy)
+        root = math.sqrt(half * half + sxy * sxy)
+        along = 0.5 * (sxx + syy) + root
         across = max(sxx + syy - along, 0.0)
         if along < 9 * across or along < 1e-6:
             continue  # a blob, not a wall
-        nx, ny = -s, c
-        if nx * points[i, 0] + ny * points[i, 1] > 0:
+        wx, wy = (root + half, sxy) if half > 0 else (sxy, root - half)
+        length = math.sqrt(wx * wx + wy * wy)
+        nx, ny = -wy / length, wx / length
+        if nx * x0 + ny * y0 > 0:
             nx, ny = -nx, -ny
         noise = max(across / (n - 2), RANGE_NOISE_M * RANGE_NOISE_M)
         normals[i, 0], normals[i, 1] = nx, ny
         variances[i, 0] = noise
         variances[i, 1] = noise / along
-
-
-@njit(cache=True, inline="always")
-def _joined(points: Array, i: int, j: int, increment: float) -> bool:
-    """Do two neighbouring beams see one wall?"""
-    gap = math.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
-    reach = math.hypot(points[i, 0], points[i, 1])
-    return gap < max(0.15, GRAZING * increment * reach)  # NaN compares false
+    return bent
 
 
 def prepare_scan(points: Array, angle_min: float, angle_increment: float) -> Scan:
     """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     normals, variances = np.empty_like(points), np.empty_like(points)
-    _fit_walls(points, angle_increment, normals, variances)
-    return Scan(points, normals, variances, angle_min, angle_increment)
+    bent_rad = _fit_walls(points, angle_min, angle_increment, normals, variances)
+    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad)
+
+
+@njit(cache=True)
+def _nearest(
+    points: Array,
+    normals: Array,
+    increment: float,
+    bent: float,
+    middle: int,
+    at: tuple[float, float, float, float, float],
+    reach: float,
+) -> int:
+    """The point of the reference (B, 2) nearest to one `at` x, y with normal nx, ny and range r, among those within
+    reach whose normals face alike; -1: none.
+
+    From the bearing of the point outwards: a point seen x rad off lies no nearer than r sin(x) (Censi 2008, section V).
+    """
+    x, y, nx, ny, r = at
+    beams = points.shape[0]
+    best, best_square = -1, reach * reach
+    for k in range(max(0, middle - beams + 1), max(middle + 1, beams - middle)):
+        off = min(max((k - 0.5) * increment - bent, 0.0), math.sqrt(2.0))
+        closest = r * (off - off * off * off / 6)  # below r sin(x)
+        if closest * closest >= best_square:
+            break
+        for j in (middle - k, middle + k):
+            if 0 <= j < beams:
+                dx, dy = x - points[j, 0], y - points[j, 1]
+                square = dx * dx + dy * dy
+                if square < best_square and nx * normals[j, 0] + ny * normals[j, 1] > 0.7:
+                    best, best_square = j, square
+    return best
+
+
+@njit(cache=True)
+def _eigen(matrix: Array, values: Array, vectors: Array) -> None:
+    """Eigenvalues (3,) and eigenvectors (3, 3), columns, of a symmetric matrix (3, 3), by Jacobi's rotations."""
+    a = matrix.copy()
+    vectors[:] = np.eye(3)
+    for _ in range(30):
+        if abs(a[0, 1]) + abs(a[0, 2]) + abs(a[1, 2]) <= 1e-15 * (abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])):
+            break
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            if a[p, q] == 0.0:
+                continue
+            theta = (a[q, q] - a[p, p]) / (2 * a[p, q])
+            t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1))
+            c = 1 / math.sqrt(t * t + 1)
+            s = t * c
+            for k in range(3):
+                a[k, p], a[k, q] = c * a[k, p] - s * a[k, q], s * a[k, p] + c * a[k, q]
+            for k in range(3):
+                a[p, k], a[q, k] = c * a[p, k] - s * a[q, k], s * a[p, k] + c * a[q, k]
+            for k in range(3):
+                vectors[k, p], vectors[k, q] = (
+                    c * vectors[k, p] - s * vectors[k, q],
+                    s * vectors[k, p] + c * vectors[k, q],
+                )
+    for k in range(3):
+        values[k] = a[k, k]
 
 
 @njit(cache=True)
@@ -131,6 +195,7 @@ def _gauss_newton(
     ref_variances: Array,
     angle_min: float,
     increment: float,
+    bent: float,
     points: Array,
     normals: Array,
     guess: Array,
@@ -144,13 +209,13 @@ def _gauss_newton(
     Returns: points on walls, those that the reference must have seen, those that matched, their rms distance to the
     line [m], converged.
     """
-    beams, count = ref_points.shape[0], points.shape[0]
+    beams = ref_points.shape[0]
+    on_walls = np.flatnonzero(np.isfinite(normals[:, 0]))
     motion[:] = guess
     converged = False
-    valid = visible = matched = 0
-    sum_squares = 0.0
-    gradient, step = np.zeros(3), np.zeros(3)
-    information, false_information = np.zeros((3, 3)), np.zeros((3, 3))
+    valid, visible, matched = len(on_walls), 0, 0
+    sum_squares = sum_weights = 0.0
+    step, values, vectors = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     lever = np.array(
         [1.0, 1.0, 1.0 / LEVER_M]
     )  # makes a radian comparable to a metre, so that eigenvectors mean something
@@ -158,31 +223,20 @@ def _gauss_newton(
     for iteration in range(max_iterations):
         reach = max(reach_m * 0.6**iteration, CLOSEST_M)
         c, s = math.cos(motion[2]), math.sin(motion[2])
-        information[:] = 0.0
-        false_information[:] = 0.0
-        gradient[:] = 0.0
-        valid = visible = matched = 0
+        visible = matched = 0
+        g0 = g1 = g2 = i00 = i01 = i02 = i11 = i12 = i22 = f00 = f01 = f02 = f11 = f12 = f22 = 0.0
         sum_squares = sum_weights = 0.0
-        for i in range(count):
-            if not math.isfinite(normals[i, 0]):
-                continue
-            valid += 1
+        for i in on_walls:
             px, py = points[i, 0], points[i, 1]
             rx, ry = c * px - s * py, s * px + c * py
             x, y = rx + motion[0], ry + motion[1]
             nx, ny = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
-            distance = math.hypot(x, y)
+            distance = math.sqrt(x * x + y * y)
             bearing = math.atan2(y, x) - angle_min
             if bearing < 0:
                 bearing += 2 * math.pi
             middle = int(bearing / increment + 0.5)
-            width = beams if distance <= reach else int(math.asin(reach / distance) / increment) + 1
-            best, best_square = -1, reach * reach
-            for j in range(max(0, middle - width), min(beams, middle + width + 1)):
-                dx, dy = x - ref_points[j, 0], y - ref_points[j, 1]
-                square = dx * dx + dy * dy
-                if square < best_square and nx * ref_normals[j, 0] + ny * ref_normals[j, 1] > 0.7:
-                    best, best_square = j, square
+            best = _nearest(ref_points, ref_normals, increment, bent, middle, (x, y, nx, ny, distance), reach)
             if best < 0:  # gone, or never in the reference's sight: beside its field of view, or behind its walls?
                 if (
                     middle < beams
@@ -196,25 +250,25 @@ def _gauss_newton(
             variance = ref_variances[best, 0] + RANGE_NOISE_M * RANGE_NOISE_M
             corner = 9.0 * variance + ((reach - CLOSEST_M) / 3.0) ** 2  # wide at first: a poor guess is no outlier
             weight = 1.0 / (variance * (1.0 + error * error / corner) ** 2)  # Geman-McClure
-            turn = -mx * ry + my * rx  # ∂error/∂θ
             matched += 1
             sum_squares += weight * error * error
             sum_weights += weight
-            row = (mx, my, turn)
-            for a in range(3):
-                gradient[a] += weight * row[a] * error
-                for b in range(3):
-                    information[a, b] += weight * row[a] * row[b]
-            tx, ty = -my, mx
-            lie = (tx, ty, -tx * ry + ty * rx)
-            for a in range(3):
-                for b in range(3):
-                    false_information[a, b] += weight * ref_variances[best, 1] * lie[a] * lie[b]
+            turn = -mx * ry + my * rx  # ∂error/∂θ; of a motion along the wall, its square
+            slide = my * ry + mx * rx
+            g0, g1, g2 = g0 + weight * mx * error, g1 + weight * my * error, g2 + weight * turn * error
+            i00, i01, i02 = i00 + weight * mx * mx, i01 + weight * mx * my, i02 + weight * mx * turn
+            i11, i12, i22 = i11 + weight * my * my, i12 + weight * my * turn, i22 + weight * turn * turn
+            doubt = weight * ref_variances[best, 1]
+            f00, f01, f02 = f00 + doubt * my * my, f01 - doubt * my * mx, f02 - doubt * my * slide
+            f11, f12, f22 = f11 + doubt * mx * mx, f12 + doubt * mx * slide, f22 + doubt * slide * slide
         if matched < max(MIN_MATCHED, MIN_OVERLAP * valid):
             break
+        gradient = np.array([g0, g1, g2])
+        information = np.array([[i00, i01, i02], [i01, i11, i12], [i02, i12, i22]])
+        false_information = np.array([[f00, f01, f02], [f01, f11, f12], [f02, f12, f22]])
         # Directions whose information is mostly pretence are left as the guess has them (Zhang 2016, solution
         # remapping).
-        values, vectors = np.linalg.eigh(information * scale)
+        _eigen(information * scale, values, vectors)
         step[:] = 0.0
         covariance[:] = 0.0
         for k in range(3):
@@ -258,6 +312,7 @@ def match_scans(
         reference.variances,
         reference.angle_min,
         reference.angle_increment,
+        reference.bent_rad,
         current.points,
         current.normals,
         np.asarray(guess, dtype=np.float64),
