@@ -31,9 +31,9 @@ def group_parts(recordings: list[Path]) -> list[tuple[Path, ...]]:
         for (a, before), (b, after) in pairwise(parts):
             if a.resolve() == b.resolve():
                 raise BadInputError(f"{a} is named twice")
-            boots = {before.metadata.get("boot_id"), after.metadata.get("boot_id")}
-            if len(boots) > 1 or None in boots:
-                raise BadInputError(f"{a} and {b} are both called run {run_id}, and are not parts of one boot's run")
-            if after.start_ns < before.end_ns - MAX_SHARED_NS:
+            boots = [info.metadata.get("boot_id") for info in (before, after)]
+            if boots[0] == boots[1] and after.start_ns < before.end_ns - MAX_SHARED_NS:
                 raise BadInputError(f"{a} and {b} hold the same time of run {run_id}; which of them is it?")
+            if boots[0] != boots[1] or boots[0] is None:
+                raise BadInputError(f"{a} and {b} are both called run {run_id}, and are not parts of one boot's run")
     return [tuple(path for path, _ in parts) for parts in runs.values()]
