@@ -152,7 +152,10 @@ CASES = [
     (f"{BUILD} --profile cu_ss534", r"good\.mcap: no message on /encoders/joint_states holds a reading of .*"),
     # the same one twice
     ("rtlog-atlas build good.mcap good.mcap -o a.atlas", r"good\.mcap is named twice"),
-    ("rtlog-atlas build good.mcap copy.mcap -o a.atlas", r"good\.mcap and copy\.mcap hold the same time of run good; which .*"),
+    (
+        "rtlog-atlas build good.mcap copy.mcap -o a.atlas",
+        r"good\.mcap and copy\.mcap hold the same time of run good; which .*",
+    ),
     # where the output cannot go
     ("rtlog-atlas build good.mcap -o there.atlas", r"there\.atlas exists already; it is left as it is"),
     ("rtlog-atlas build none.mcap -o there.atlas", r"there\.atlas exists already; .*"),  # told before any work
