@@ -6,19 +6,15 @@ of them, PSS once.
 """
 
 import argparse
-import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import zenoh
-from emulated_vehicle import emulated_vehicle
+from emulated_vehicle import emulated_vehicle, running_server
 
-from hw_profiles.profile import load_profile
 from rtlog_server.messages import decode, to_ns
 
 MOST_CPU = 0.10  # of one core
@@ -50,29 +46,19 @@ def processes(server: int) -> dict[str, int]:
 
 def measure(profile: Path, seconds: float) -> dict[str, float]:
     """Run the server on a profile for a while."""
-    endpoint = load_profile(profile).zenoh.listen[0]
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("connect/timeout_ms", "10000")
     ticks: list[bytes] = []
     samples: list[str] = []
     began_ns = time.time_ns()
-    command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
-        try:
-            with zenoh.open(config) as session:
-                session.declare_subscriber("rtlog/full_suite/rtlog/tick", lambda s: ticks.append(s.payload.to_bytes()))
-                session.declare_subscriber("rtlog/full_suite/**", lambda s: samples.append(str(s.key_expr)))
-                time.sleep(SETTLE_S)
-                found = processes(server.pid)
-                before = {name: usage(process) for name, process in found.items()}
-                from_s, samples_before = time.monotonic(), len(samples)
-                time.sleep(seconds)
-                after = {name: usage(process) for name, process in found.items()}
-                elapsed_s, samples_after = time.monotonic() - from_s, len(samples)
-        finally:
-            server.terminate()
+    with running_server(profile) as (server, session):
+        session.declare_subscriber("rtlog/full_suite/rtlog/tick", lambda s: ticks.append(s.payload.to_bytes()))
+        session.declare_subscriber("rtlog/full_suite/**", lambda s: samples.append(str(s.key_expr)))
+        time.sleep(SETTLE_S)
+        found = processes(server.pid)
+        before = {name: usage(process) for name, process in found.items()}
+        from_s, samples_before = time.monotonic(), len(samples)
+        time.sleep(seconds)
+        after = {name: usage(process) for name, process in found.items()}
+        elapsed_s, samples_after = time.monotonic() - from_s, len(samples)
     tick = decode(ticks[-1], "rtlog_msgs/msg/Tick")
     states = {sensor.name: sensor.state for sensor in tick.sensors}
     if len(states) != 4 or any(states.values()):

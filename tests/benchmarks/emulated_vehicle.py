@@ -1,6 +1,7 @@
 """The full suite of a vehicle as emulators in a process of their own: two scanners at 50 Hz, two encoders, a reader.
 
-    with emulated_vehicle(folder) as profile:      the path of a profile that leads to them
+    with emulated_vehicle(folder) as profile:                 the path of a profile that leads to them
+        with running_server(profile) as (process, session):   rtlog-server on it, and a zenoh client of that
 
 Run as a script it is that process: it writes the profile's device addresses to stdout as JSON and ends with its stdin.
 """
@@ -15,8 +16,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from hw_profiles.profile import load_profile
+
+if TYPE_CHECKING:
+    import zenoh
 
 RAYS, STEP_RAD = 541, math.radians(0.5)
 SCAN_S = 0.02
@@ -59,6 +66,31 @@ def emulated_vehicle(folder: Path) -> Iterator[Path]:
         profile.write_text(PROFILE.format(**places, zenoh=zenoh_port))
         yield profile
         process.communicate()
+
+
+@contextmanager
+def running_server(profile: Path) -> Iterator[tuple[subprocess.Popen[bytes], "zenoh.Session"]]:
+    """`rtlog-server run` in a process of its own; ended with SIGTERM, as systemd does."""
+    import zenoh
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps(load_profile(profile).zenoh.listen))
+    config.insert_json5("connect/retry", "{ period_init_ms: 50, period_max_ms: 50 }")
+    config.insert_json5("connect/timeout_ms", "30000")
+    command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            with zenoh.open(config) as session:
+                yield process, session
+        finally:
+            process.terminate()
+
+
+def ask_status(session: "zenoh.Session") -> dict[str, Any]:
+    """What the server answers to `@status`."""
+    (reply,) = session.get("rtlog/full_suite/@status", timeout=10.0)
+    return json.loads(reply.ok.payload.to_bytes())
 
 
 def emulate(encoder_link: Path) -> None:
