@@ -88,12 +88,12 @@ class Cia406Encoders(Device[EncoderReading]):
                 self._rounds.join(node.encoder.name)
 
     def read(self) -> None:
+        self._tell_health()
         self._serve(time.monotonic_ns() + int(READ_S * 1e9), until=lambda: self._due() is not None)
         if (node := self._due()) is not None:
             self._bring_up(node)
             if node.running and self._rounds is not None:
                 self._rounds.join(node.encoder.name)
-        self._tell_health()
         if not any(node.running for node in self._nodes.values()):
             raise DeviceError(f"{self._bus.place}: {self._problems()}")
 

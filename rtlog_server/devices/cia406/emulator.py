@@ -70,6 +70,21 @@ class CanBusEmulator:
         """The encoder reports an error; code 0: it is gone."""
         self.send(protocol.encode_emergency(Emergency(node, code, register, vendor)))
 
+    def adapter_noise(self, data: bytes) -> None:
+        """The slcan adapter sends bytes that are none of its protocol."""
+
+        def write() -> list[Frame]:
+            assert isinstance(self._port, SlcanAdapter)
+            self._port.write(data)
+            return []
+
+        self._wanted.append(write)
+
+    def wait_until_done(self) -> None:
+        """Until all that was asked for above is done."""
+        while self._wanted:
+            time.sleep(WATCH_S / 10)
+
     def send(self, frame: Frame) -> None:
         """Any frame, as of another device on the bus."""
         self._wanted.append(lambda: [frame])
@@ -107,10 +122,17 @@ class CanBusEmulator:
                     frames += encoder.tick(now_ns)
             self._send(frames)
             due_ns = min((encoder.due_ns() for encoder in present), default=now_ns + 10**9)
-            received = self._port.receive(min(WATCH_S, max(0.0, (due_ns - now_ns) * 1e-9)))
+            received = self._receive(min(WATCH_S, max(0.0, (due_ns - now_ns) * 1e-9)))
             if received is not None:
                 frame, arrived_ns = received
                 self._send([answer for encoder in present for answer in encoder.take(frame, arrived_ns)])
+
+    def _receive(self, timeout_s: float) -> tuple[Frame, int] | None:
+        try:
+            return self._port.receive(timeout_s)
+        except DeviceError:  # a fault of the bus: a node waits until it is over
+            self._unplugged.wait(WATCH_S)
+            return None
 
     def _send(self, frames: list[Frame]) -> None:
         for frame in frames:

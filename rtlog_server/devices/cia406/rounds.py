@@ -15,7 +15,6 @@ from rtlog_server.devices.encoders import Fix
 
 MARGIN_NS = 4_000_000  # from the last position to the tick
 REPLY_NS = 2_000_000  # first guess of what all replies take
-PATIENCE_NS = 20_000_000  # for replies, on top of their time on the wire
 SMOOTHING = 8  # rounds over which the time of the replies is averaged
 STALE_TIMERS = 3  # a position so many periods of the encoder's timer old is no longer used
 
@@ -33,7 +32,7 @@ class SyncRounds:
         self._grid = grid
         self._sync_wire_ns = sync_wire_ns
         self._reply_ns = REPLY_NS + reply_wire_ns
-        self._patience_ns = PATIENCE_NS + reply_wire_ns
+        self._patience_ns = grid.period_ns // 2  # for replies
         self._tick_ns = 0
         self._latched_ns: int | None = None  # of the open round
         self._fixes: dict[str, Fix] = {}
@@ -107,7 +106,8 @@ class TimerRounds:
     def next_ns(self, now_ns: int) -> int:
         """When `step` has something to do."""
         if self._tick_ns <= now_ns:
-            self._tick_ns = self._grid.next_after(now_ns + MARGIN_NS)
+            first_ns = self._stale_ns if self._tick_ns == 0 else 0  # until all have sent a position
+            self._tick_ns = self._grid.next_after(now_ns + MARGIN_NS + first_ns)
         return self._tick_ns - MARGIN_NS
 
     def step(self, now_ns: int) -> Mapping[str, Fix]:
