@@ -32,6 +32,7 @@ kinematics = "differential"
 track_width_m = 1.6
 [lasers.primary]
 device = {{ host = "127.0.0.1", port = {laser_port} }}
+{auxiliary_laser}
 [[encoders]]
 name = "left_wheel"
 role = "left_wheel"
@@ -209,6 +210,7 @@ def values_of_absent_devices(folder: Path) -> dict[str, object]:
         "name": "testbed",
         "tick_period_s": 0.1,
         "laser_port": find_free_port(),
+        "auxiliary_laser": "",
         "encoder_port": folder / "absent",
         "rfid_port": find_free_port(),
         "zenoh_port": find_free_port(),
