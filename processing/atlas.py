@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError, RTLogError
+from processing.atlas_schema import check_document
 from processing.map_files import Overlay, write_map
 from processing.occupancy_grid import Grid, stitch, trim
 from processing.tum import write_tum
@@ -83,7 +84,7 @@ def _write_files(folder: Path, atlas: Atlas) -> None:
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """What atlas.json holds. Raises: BadInputError: there is no atlas, or one of another schema."""
+    """What atlas.json holds. Raises: BadInputError: there is no atlas, one of another schema, or a damaged one."""
     try:
         document = json.loads((path / "atlas.json").read_text(encoding="utf-8"))
     except OSError as error:
@@ -92,6 +93,7 @@ def read_document(path: Path) -> dict[str, Any]:
         raise BadInputError(f"{path}/atlas.json: not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise BadInputError(f"{path}/atlas.json: schema is not {SCHEMA}; another version of rtlog-atlas wrote it")
+    check_document(document, f"{path}/atlas.json")
     return document
 
 

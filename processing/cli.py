@@ -113,7 +113,7 @@ def _info(args: argparse.Namespace) -> None:
         print(f"run   {run['id']}: {run['ticks']} ticks, profile {run['profile']}")
     for node in document["nodes"]:
         place = f"({node['x']:.2f}, {node['y']:.2f}) m"
-        unread = sum(not each["read"] for each in node["passes"])
+        unread = sum(not each.get("read", True) for each in node["passes"])
         reach = f"read within {node['range']:.1f} m, {len(node['passes'])} passes" + f", {unread} unread" * (unread > 0)
         print(f"node  {node['id']}: {node['epc']} at {place}, {reach}")
     for edge in document["edges"]:
@@ -121,7 +121,7 @@ def _info(args: argparse.Namespace) -> None:
         print(
             f"{edge['kind']:5} {edge['id']}: {len(edge['paths'])} paths{length}, {edge['links']['strong']} strong links"
         )
-    for line in [*map(_left_out, document["left_out"]), *document["remarks"]]:
+    for line in [*map(_left_out, document.get("left_out", [])), *document["remarks"]]:
         print(f"note  {line}")
 
 

@@ -23,14 +23,22 @@ from processing.occupancy_grid import Grid
 from processing.tum import read_tum
 from rtlog_client.log_file import read_info
 
-EDGE = {"id": "0-1", "i": 0, "j": 1, "length": 4.0}
-NODES = [{"id": k, "epc": f"E20{k}", "x": 4.0 * k, "y": 0.0} for k in range(2)]
+RUNS = [{"id": run_id, "sha256": "", "ticks": 3, "profile": "p"} for run_id in ("monday", "tuesday")]
+PATHS = [{"run": "monday", "from": 0, "to": 2, "direction": 1}]
+EDGE = {"id": "0-1", "kind": "edge", "i": 0, "j": 1, "length": 4.0, "part": 0}
+EDGE |= {"links": {"weak": 2, "strong": 0}, "paths": PATHS}
+PASSES = [{"run": "monday", "tick": 2, "range": 2.0}]
+NODES = [
+    {"id": k, "epc": f"E20{k}", "x": 4.0 * k, "y": 0.0, "theta": 0.0, "range": 2.0, "part": 0, "passes": PASSES}
+    for k in range(2)
+]
+DOCUMENT = {"schema": 1, "runs": RUNS, "nodes": NODES, "edges": [EDGE], "remarks": ["Grüße"]}
 
 
 def tiny_atlas(**changes: Any) -> Atlas:
     grid = Grid(np.full((20, 50), -1.0, np.float32), 0.1, np.array([-0.5, -1.0]))
     parts: dict[str, Any] = {
-        "document": {"schema": 1, "nodes": NODES, "edges": [EDGE], "remarks": ["Grüße"]},
+        "document": DOCUMENT,
         "edges": {"0-1": {"poses": np.zeros((3, 3))}},
         "trajectories": {"monday": (np.arange(3), np.zeros((3, 3))), "tuesday": (np.arange(2), np.ones((2, 3)))},
         "grids": [grid],
@@ -182,6 +190,26 @@ def test_what_is_no_atlas_is_refused(tmp_path: Path, text: str | None, complaint
     if text is not None:
         (tmp_path / "atlas.json").write_text(text)
     with pytest.raises(BadInputError, match=complaint):
+        read_document(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"nodes": [NODES[0], {"id": 1}]}, r"missing required field `epc` at `nodes\[1\]`"),
+        ({"remarks": None}, r"Expected `array`, got `null` at `remarks`"),
+        (
+            {"edges": [EDGE | {"paths": [{"run": "monday"}]}]},
+            r"missing required field `from` at `edges\[0\]\.paths\[0\]`",
+        ),
+        ({"edges": [EDGE | {"kind": "bow"}]}, r"Invalid enum value 'bow'"),
+        ({"edges": [EDGE | {"j": 2}]}, "edge 0-1 ends at a node that is not there"),
+        ({"runs": RUNS[1:]}, "edge 0-1 holds a path of monday, which is no run of it"),
+    ],
+)
+def test_what_is_missing_in_an_atlas_is_named(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:
+    (tmp_path / "atlas.json").write_text(json.dumps(DOCUMENT | changes))
+    with pytest.raises(BadInputError, match=rf"atlas\.json: .*{complaint}"):
         read_document(tmp_path)
 
 

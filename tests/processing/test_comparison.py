@@ -36,11 +36,14 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
         poses = compose(move, truth_of(run_id))
         write_tum(atlas / "trajectories" / f"{run_id}.tum", STAMPS, poses)
         for k, index in enumerate((20, 250)):
-            passes = [{"run": run_id, "tick": index}]
-            x, y = poses[index, :2].tolist()
-            nodes.append({"epc": f"E{part}{k}", "x": x, "y": y, "part": part, "passes": passes})
-        edges.append({"i": 2 * part, "j": 2 * part + 1, "part": part, "paths": [{"run": run_id}]})
-        edges.append({"i": 2 * part, "j": None, "part": part, "paths": [{"run": run_id}]})
+            place = dict(zip(("x", "y", "theta"), poses[index].tolist(), strict=True))
+            passes = [{"run": run_id, "tick": index, "range": 2.0}]
+            node = {"id": 2 * part + k, "epc": f"E{part}{k}", "range": 2.0, "part": part, "passes": passes}
+            nodes.append(place | node)
+        path = {"run": run_id, "from": 0, "to": 300, "direction": 1}
+        common = {"i": 2 * part, "length": None, "part": part, "paths": [path], "links": {"weak": 0, "strong": 0}}
+        edges.append(common | {"id": f"{part}", "kind": "edge", "j": 2 * part + 1})
+        edges.append(common | {"id": f"{part}-spur", "kind": "spur", "j": None})
         walls.append(WALLS + np.array([0, 100 * part] * 2))
         for x1, y1, x2, y2 in walls[-1]:
             share = np.linspace(0, 1, 2000)[:, None]
@@ -51,7 +54,8 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     log_odds = np.zeros((rows.max() + 1, columns.max() + 1), dtype=np.float32)
     log_odds[rows, columns] = 3
     write_map(atlas, Grid(log_odds, 0.05, low * 0.05))
-    document = {"schema": 1, "runs": [{"id": run_id} for run_id in MOVES], "nodes": nodes, "edges": edges}
+    listed = [{"id": run_id, "sha256": "", "ticks": 301, "profile": "p"} for run_id in MOVES]
+    document = {"schema": 1, "runs": listed, "nodes": nodes, "edges": edges, "remarks": []}
     (atlas / "atlas.json").write_text(json.dumps(document))
     np.savetxt(truth / "walls.csv", np.concatenate(walls), "%.4f", ",", header="x1,y1,x2,y2", comments="")
     (truth / "tags.csv").write_text("epc,x,y\nE00,4.4080,2.5000\n")
