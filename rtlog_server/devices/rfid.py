@@ -7,8 +7,8 @@ from dataclasses import dataclass
 class TagSample:
     """Reads of one tag by one antenna that the reader told of at once."""
 
-    measured_ns: int  # monotonic; when the host received it: a reader's own clock may start in 1970
-    complete_ns: int  # monotonic; the same
+    measured_ns: int  # monotonic; the last of these reads, by the reader's clock if that is right, else as complete_ns
+    complete_ns: int  # monotonic; when the host received it
     epc: str  # upper-case hex, no spaces
     antenna: int  # 0 … 255
     count: int  # reads since the reader last told of this tag, 1 or more

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from rtlog_server.devices.alien import protocol
 from rtlog_server.devices.alien.console import Console
 from rtlog_server.devices.alien.protocol import AlienError
+from rtlog_server.devices.alien.tag_line import parse_date_ms
 
 MAX_TEXT = 120  # of what a reader may say of itself
 
@@ -71,6 +72,6 @@ def ask_setting(console: Console, name: str) -> str:
 
 def _clock_error_s(clock: str, utc_ns: int) -> float | None:
     try:
-        return round(protocol.parse_date_ms(clock) * 1e-3 - utc_ns * 1e-9, 3)
+        return round(parse_date_ms(clock) * 1e-3 - utc_ns * 1e-9, 3)
     except AlienError:
         return None

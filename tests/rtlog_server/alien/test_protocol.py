@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtlog_server.devices.alien import protocol
-from rtlog_server.devices.alien.protocol import AlienError, Prompt, TagRead
+from rtlog_server.devices.alien import protocol, tag_line
+from rtlog_server.devices.alien.protocol import AlienError, Prompt
+from rtlog_server.devices.alien.tag_line import TagRead
 
-SAMPLES = Path(__file__).parents[3] / "shared" / "data" / "alien"
+SAMPLES = Path(__file__).parents[4] / "shared" / "data" / "alien"
 
 # A line of a reader's tag stream, as quoted in the tests of RfidDotNet (TagStreamParserTests).
 STREAM_LINE = "E20000165919007818405C7B;1518784324007;1518784353958;0;-40.3;908"
@@ -30,12 +31,12 @@ def samples() -> dict[str, Any]:
 
 def test_a_custom_line_has_all_fields() -> None:
     tag = TagRead("E20000165919007818405C7B", 0, 908, -40.3, 1518784324007, 1518784353958)
-    assert protocol.parse_tag(STREAM_LINE) == tag
-    assert protocol.format_tag(tag, "CUSTOM", protocol.TAG_FORMAT) == STREAM_LINE
+    assert tag_line.parse_tag(STREAM_LINE) == tag
+    assert tag_line.format_tag(tag, "CUSTOM", tag_line.TAG_FORMAT) == STREAM_LINE
 
 
 def test_a_text_line_has_dates_of_the_readers_clock() -> None:
-    tag = protocol.parse_tag(TEXT_LINE)
+    tag = tag_line.parse_tag(TEXT_LINE)
     assert tag is not None
     assert (tag.epc, tag.count, tag.antenna) == ("1115F26881C3C012", 4, 0)
     assert tag.last_seen_ms == 1_043_139_651_000
@@ -44,7 +45,7 @@ def test_a_text_line_has_dates_of_the_readers_clock() -> None:
 
 def test_a_terse_line_is_antenna_and_count_unless_a_zero_says_otherwise() -> None:
     for line, antenna, count in (("1115 F268 81C3 C012,4,0", 0, 4), ("35E4 4B57,0,1", 0, 1), ("35E4 4B57,2,9", 2, 9)):
-        tag = protocol.parse_tag(line)
+        tag = tag_line.parse_tag(line)
         assert tag is not None
         assert (tag.antenna, tag.count) == (antenna, count)
         assert tag.last_seen_ms is None
@@ -54,7 +55,7 @@ def test_a_terse_line_is_antenna_and_count_unless_a_zero_says_otherwise() -> Non
     "line", ["", "  ", "#Alien RFID Reader Tag Stream", "(No Tags)", "#Time: 1970/01/01 00:00:00.0"]
 )
 def test_other_lines_are_no_tags(line: str) -> None:
-    assert protocol.parse_tag(line) is None
+    assert tag_line.parse_tag(line) is None
 
 
 @pytest.mark.parametrize(
@@ -76,7 +77,7 @@ def test_other_lines_are_no_tags(line: str) -> None:
 )
 def test_what_is_no_tag_is_refused(line: str) -> None:
     with pytest.raises(AlienError, match=r"no tag: "):
-        protocol.parse_tag(line)
+        tag_line.parse_tag(line)
 
 
 def test_the_samples_of_real_readers_are_read(samples: dict[str, Any]) -> None:
@@ -84,7 +85,7 @@ def test_the_samples_of_real_readers_are_read(samples: dict[str, Any]) -> None:
     assert samples["manual_text_taglist"]["text"] == TEXT_LINE
     message = samples["alr9900plus_notify_text"]["text"].replace("\n", "\r\n").encode() + b"\r\n\0"
     lines = protocol.line_splitter().feed(message)
-    tags = [tag for line in lines if (tag := protocol.parse_tag(line))]
+    tags = [tag for line in lines if (tag := tag_line.parse_tag(line))]
     assert tags == [TagRead("11C400E32A39", 0, 1, tags[0].rssi, 6019593285, 6020253285)]
     for name, value in samples["alr9650_info"]["fields"].items():
         assert protocol.parse_setting(f"{name} = {value}") == (name.lower(), value)
@@ -95,7 +96,7 @@ def test_a_real_notification_is_read_however_the_wire_cuts_it(samples: dict[str,
     whole = protocol.line_splitter().feed(message)
     slowly = protocol.line_splitter()
     assert [line for byte in message for line in slowly.feed(bytes([byte]))] == whole
-    tags = [tag for line in whole if (tag := protocol.parse_tag(line))]
+    tags = [tag for line in whole if (tag := tag_line.parse_tag(line))]
     assert [(tag.epc, tag.antenna, tag.count) for tag in tags] == [
         ("35E44B573390000A0F29B40A", 0, 1),
         ("35F384108DEE8E8B377EF26D", 0, 1),
@@ -166,7 +167,7 @@ def test_replies() -> None:
 def test_any_bytes_give_tags_or_an_alien_error(data: bytes) -> None:
     for line in protocol.line_splitter().feed(data):
         protocol.find_prompt(line)
-        for parse in (protocol.parse_tag, protocol.parse_setting):
+        for parse in (tag_line.parse_tag, protocol.parse_setting):
             try:
                 parse(line)
             except AlienError:
@@ -180,7 +181,7 @@ FIELD = st.one_of(st.integers(-5, 10**20).map(str), st.text(alphabet="0123456789
 def test_near_misses_give_whole_tags_or_an_alien_error(fields: list[str], separator: str) -> None:
     for line in (separator.join(fields), "Tag:" + separator.join(fields)):
         try:
-            tag = protocol.parse_tag(line)
+            tag = tag_line.parse_tag(line)
         except AlienError:
             continue
         if tag is not None:
@@ -199,8 +200,8 @@ def test_near_misses_give_whole_tags_or_an_alien_error(fields: list[str], separa
 )
 def test_what_a_reader_sends_is_read(epc: str, antenna: int, count: int, rssi: float, seen_ms: int) -> None:
     tag = TagRead(epc, antenna, count, rssi, seen_ms, seen_ms)
-    custom = protocol.parse_tag(protocol.format_tag(tag, "CUSTOM", protocol.TAG_FORMAT))
+    custom = tag_line.parse_tag(tag_line.format_tag(tag, "CUSTOM", tag_line.TAG_FORMAT))
     assert repr(custom) == repr(tag)  # NaN is no equal of itself
-    text = protocol.parse_tag(protocol.format_tag(tag, "TEXT", ""))
+    text = tag_line.parse_tag(tag_line.format_tag(tag, "TEXT", ""))
     assert text is not None
     assert (text.epc, text.antenna, text.count, text.last_seen_ms) == (epc, antenna, count, seen_ms)
