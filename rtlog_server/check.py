@@ -1,84 +1,158 @@
-"""Is every device there? Each is opened as the server would, all at once, for a few seconds."""
+"""Is every device there and well? Each is opened as the server would, for some seconds, then asked who and how it is.
 
+In: a profile. Out: `Finding`s of each device, in the order of the profile; what a device tells of itself is its
+folder's business (devices/*/check.py). The law: a server at work is left alone, for it holds the devices.
+"""
+
+import errno
+import socket
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from hw_profiles.profile import CanBus, Profile, SeiBus
+from hw_profiles.errors import RTLogError
+from hw_profiles.profile import CanBus, Laser, Profile, RfidDevice, SeiBus
 from rtlog_server.devices import open_devices
-from rtlog_server.devices.device import Device, TickGrid
+from rtlog_server.devices.alien.check import check_reader
+from rtlog_server.devices.device import Device, DeviceError, TickGrid
+from rtlog_server.devices.finding import Finding
+from rtlog_server.devices.lms111.check import check_scanner
+from rtlog_server.devices.sei.check import check_bus
 
-TIME_LIMIT_S = 3.0  # an encoder bus left at the wrong speed takes a second attempt
-FIRST_SAMPLES_S = 1.0
+TIME_LIMIT_S = (
+    5.0  # to connect: an encoder bus left at the wrong speed takes a second attempt, a scanner starts its motor
+)
+RATE_S = 2.0  # over which rates are measured, or three ticks
+RATE_TOLERANCE = 0.1
 POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class CheckResult:
-    device: str
-    address: str
-    reachable: bool
-    identity: dict[str, str]
-    message: str  # "connected", or what is wrong
-    advice: str  # what to do next; empty if nothing
+class Place:
+    """A device as the profile has it."""
+
+    ask: Callable[[], list[Finding]]  # who it is and how; raises DeviceError if it is not there
+    rate_hz: float | None  # of its samples; None: they come when there is something to tell
+    advice: str  # what to look at when it does not answer
 
 
-def check_devices(profile: Profile, time_limit_s: float = TIME_LIMIT_S) -> list[CheckResult]:
-    """Try every device of the profile. Raises: BadInputError: the profile lacks a device section."""
-    devices = open_devices(profile)
+def check_devices(profile: Profile, time_limit_s: float = TIME_LIMIT_S) -> dict[str, list[Finding]]:
+    """Try every device of the profile; what was found, by device.
+
+    Raises:
+        BadInputError: the profile lacks a device section.
+        RTLogError: the server is running.
+    """
+    devices, places = open_devices(profile), _places(profile)
+    _leave_server_alone(profile)
     grid = TickGrid(time.monotonic_ns(), round(profile.tick_period_s * 1e9))
-    for device in devices:
-        device.start(grid)
-    deadline = time.monotonic() + time_limit_s
-    results = [_result(profile, device, _wait_for(device, deadline)) for device in devices]
-    for device in devices:
-        device.close(timeout_s=0.0)
-    for device in devices:
-        device.close()
-    return results
+    with ThreadPoolExecutor(len(devices) or 1) as pool:
+        check = partial(_check, profile=profile, grid=grid, time_limit_s=time_limit_s)
+        findings = pool.map(lambda device: check(device, places[device.name]), devices)
+        return {device.name: found for device, found in zip(devices, findings, strict=True)}
 
 
-def _wait_for(device: Device[Any], deadline: float) -> str:
-    """Wait until the device delivers; what is wrong with it, or "" if it is well."""
+def _leave_server_alone(profile: Profile) -> None:
+    for endpoint in profile.zenoh.listen:
+        protocol, _, address = endpoint.partition("/")
+        host, _, port = address.rpartition(":")
+        if protocol != "tcp" or not port.isdigit():
+            continue
+        try:
+            socket.create_server((host, int(port))).close()
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                reason = f"{endpoint} is taken: the server is running and holds the devices"
+                raise RTLogError(f"{reason}; systemctl stop rtlog-server, then check") from error
+
+
+def _check(device: Device[Any], place: Place, profile: Profile, grid: TickGrid, time_limit_s: float) -> list[Finding]:
+    device.start(grid)
+    watched = _watch(device, place, grid, time.monotonic() + time_limit_s)
+    device.close()
+    if isinstance(profile.encoder_bus, CanBus) and device.name == "encoders":
+        from rtlog_server.devices.cia406.check import judge_bus  # here, as in open_devices
+
+        return [*judge_bus(profile.encoder_bus, profile.encoders, device.identity, device.diagnostics), *watched]
+    try:
+        return [*place.ask(), *watched]  # only now: a scanner tells its serial number when it measures
+    except (DeviceError, OSError) as error:
+        return [Finding("reachable", str(error), False, place.advice)]
+
+
+def _watch(device: Device[Any], place: Place, grid: TickGrid, deadline: float) -> list[Finding]:
+    """How it delivers."""
     while not device.connected:
         if time.monotonic() > deadline:
-            return device.message
+            return [Finding("connected", device.message, False, place.advice)]
         time.sleep(POLL_S)
-    deadline = time.monotonic() + FIRST_SAMPLES_S
-    samples = 0
-    while samples < 2 and device.connected and time.monotonic() < deadline:  # at the second, the first is judged
+    stamps_ns: list[int] = []
+    age_s = float("inf")
+    watched_s = max(RATE_S, 3e-9 * grid.period_ns)
+    deadline = time.monotonic() + watched_s
+    while device.connected and time.monotonic() < deadline:
         time.sleep(POLL_S)
-        samples += len(device.collect(time.monotonic_ns()).samples)
-    if device.connected and not samples and device.name != "rfid":  # without a tag nearby a reader has nothing to tell
-        return f"connected, but no data came within {FIRST_SAMPLES_S:.0f} s"
-    return "" if device.message == "connected" else device.message
+        collected = device.collect(time.monotonic_ns())
+        stamps_ns += [sample.measured_ns for sample in collected.samples]
+        age_s = collected.age_s
+    well = device.connected and device.message == "connected"
+    findings = [Finding("connected", device.message, well, "" if well else place.advice)]
+    if place.rate_hz is not None:
+        findings += _judge_stream(stamps_ns, age_s, place.rate_hz, watched_s)
+    return findings
 
 
-def _result(profile: Profile, device: Device[Any], problem: str) -> CheckResult:
-    address, advice = _whereabouts(profile)[device.name]
-    message, advice = (problem, advice) if problem else ("connected", "")
-    return CheckResult(device.name, address, not problem, dict(device.identity), message, advice)
+def _judge_stream(stamps_ns: list[int], age_s: float, wanted_hz: float, watched_s: float) -> list[Finding]:
+    """Rate by the samples' own stamps, and whether these follow this board's clock."""
+    if len(stamps_ns) < 2:
+        return [Finding("rate", f"{len(stamps_ns)} samples in {watched_s:.0f} s", False, "the cable, and its load")]
+    rate_hz = (len(stamps_ns) - 1) / ((stamps_ns[-1] - stamps_ns[0]) * 1e-9)
+    well = abs(rate_hz - wanted_hz) <= RATE_TOLERANCE * wanted_hz
+    advice = "" if well else "samples are lost or late: the cable, the network's load, other clients of the device"
+    rate = Finding("rate", f"{rate_hz:.1f} Hz, wanted {wanted_hz:.1f}", well, advice)
+    fresh = age_s < 3 / wanted_hz + 0.2
+    advice = "" if fresh else "its clock does not run as this board's does: switch it off and on"
+    return [rate, Finding("clock", f"newest sample {age_s * 1e3:.0f} ms old by its stamp", fresh, advice)]
 
 
-def _whereabouts(profile: Profile) -> dict[str, tuple[str, str]]:
-    """For each device: its address, and what to look at when it does not answer there."""
+def _places(profile: Profile) -> dict[str, Place]:
+    """By the names of `open_devices`, which has checked the profile to say where they are."""
     places = {}
     for name, laser in (("primary", profile.lasers.primary), ("auxiliary", profile.lasers.auxiliary)):
         if laser is not None and laser.device is not None:
-            host, port = laser.device.host, laser.device.port
-            places[f"laser/{name}"] = (f"{host}:{port}", f"power, cable; ping {host}; CoLa port {port} (2111 or 2112)")
+            places[f"laser/{name}"] = _scanner(laser)
     if profile.encoder_bus is not None:
-        places["encoders"] = (profile.encoder_bus.place, _encoder_advice(profile.encoder_bus))
+        places["encoders"] = _encoders(profile, profile.encoder_bus)
     if profile.rfid is not None and profile.rfid.device is not None:
-        host, port = profile.rfid.device.host, profile.rfid.device.port
-        places["rfid"] = (f"{host}:{port}", f"power, cable; ping {host}; telnet {host} {port}; user and password")
+        places["rfid"] = _reader(profile.rfid.device)
     return places
 
 
-def _encoder_advice(bus: SeiBus | CanBus) -> str:
+def _scanner(laser: Laser) -> Place:
+    settings = laser.device
+    assert settings is not None  # checked by the caller
+    advice = f"power, cable; ping {settings.host}; CoLa port {settings.port} (2111 or 2112)"
+    return Place(partial(check_scanner, settings), settings.scan_frequency_hz, advice)
+
+
+def _encoders(profile: Profile, bus: SeiBus | CanBus) -> Place:
+    rate_hz = 1 / profile.tick_period_s
     if isinstance(bus, SeiBus):
-        return f"adapter, encoders' power, addresses; ls -l {bus.port}; group dialout"
-    wiring = "encoders' power, node ids, terminators, bit rate"
+        advice = f"adapter, encoders' power, addresses; ls -l {bus.port}; group dialout"
+        return Place(partial(check_bus, bus, profile.encoders), rate_hz, advice)
+    advice = "encoders' power, node ids, terminators, bit rate"
     if bus.interface == "socketcan":
-        return f"{wiring}; ip -details link show {bus.channel}"
-    return f"{wiring}; ls -l {bus.channel}; group dialout" if bus.interface == "slcan" else wiring
+        advice += f"; ip -details link show {bus.channel}"
+    elif bus.interface == "slcan":
+        advice += f"; ls -l {bus.channel}; group dialout"
+    return Place(list, rate_hz, advice)
+
+
+def _reader(settings: RfidDevice) -> Place:
+    advice = f"power, cable; ls -l {settings.serial_port}; group dialout"
+    if not settings.serial_port:
+        advice = f"power, cable; ping {settings.host}; telnet {settings.host} {settings.port}; user and password"
+    return Place(partial(check_reader, settings), None, advice)

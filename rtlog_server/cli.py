@@ -9,10 +9,10 @@ from dataclasses import asdict
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.profile import load_profile, parse_profile, read_profile_text, shipped_profiles
-from rtlog_server.check import CheckResult, check_devices
+from rtlog_server.check import check_devices
 from rtlog_server.daemon import run
 
-COLUMNS = ("device", "address", "reachable", "identity", "what to do next")
+COLUMNS = ("device", "", "", "found", "what to do next")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         verbs,
         "check",
         check,
-        "Try every device for a few seconds and print a table; exit status 1 if one is not well.",
+        "Ask every device how it is, watch it for some seconds, print a table; exit status 1 if something is wrong.",
         "rtlog-server check --profile canmet_trailer",
     )
     check_parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
@@ -52,17 +52,13 @@ def run_server(args: argparse.Namespace) -> None:
 def check(args: argparse.Namespace) -> int:
     logging.basicConfig(level=logging.CRITICAL)  # the table says it all
     results = check_devices(load_profile(args.profile))
+    rows = [(device, finding) for device, findings in results.items() for finding in findings]
     if args.json:
-        print(json.dumps([asdict(result) for result in results], indent=2))
+        print(json.dumps([{"device": device} | asdict(finding) for device, finding in rows], indent=2))
     else:
-        print(format_table([COLUMNS, *map(_row, results)]))
-    return 0 if all(result.reachable for result in results) else 1
-
-
-def _row(result: CheckResult) -> tuple[str, ...]:
-    identity = ", ".join(f"{key} {value}" for key, value in result.identity.items())
-    next_step = f"{result.message}: {result.advice}" if result.advice else ""
-    return result.device, result.address, "yes" if result.reachable else "no", identity, next_step
+        told = [(device, f.subject, "ok" if f.well else "WRONG", f.found, f.advice) for device, f in rows]
+        print(format_table([COLUMNS, *told]))
+    return 0 if all(finding.well for _, finding in rows) else 1
 
 
 def format_table(rows: Sequence[tuple[str, ...]]) -> str:

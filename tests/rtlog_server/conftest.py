@@ -172,6 +172,7 @@ class Drive:
             "rfid_port": self.rfid.port,
         }
         self.first_rays_ns: list[int] = []
+        self.scan_s = 0.02
         self.tag_reads = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._measure)
@@ -181,7 +182,9 @@ class Drive:
         return round(self.TURNS_PER_S[address] * self.COUNTS_PER_TURN * now_ns * 1e-9)
 
     def _measure(self) -> None:
-        while not self._stopping.wait(0.02):
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            due += self.scan_s  # what a busy machine misses is made up for
             ranges_m = np.full(self.RAYS, 1.0 + len(self.first_rays_ns) * 1e-3)
             self.first_rays_ns.append(time.monotonic_ns())
             start_rad, remission = math.radians(-135), np.full(self.RAYS, 100.0)

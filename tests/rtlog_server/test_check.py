@@ -1,52 +1,124 @@
-"""`check` with devices that are there or half there, on emulators at the wire."""
+"""`check` with devices that are there, half there or not well, on emulators at the wire."""
 
 import json
+import re
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hw_profiles.profile import load_profile
+from hw_profiles.profile import CanBus, Profile, load_profile, parse_profile
 from rtlog_server.check import check_devices
 from rtlog_server.cli import main
+from rtlog_server.devices.cia406.emulator import CanBusEmulator
+from rtlog_server.devices.finding import Finding
+
+Found = dict[tuple[str, str], Finding]
 
 
-def test_devices_that_are_there_are_identified(
-    drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def check(profile: Profile, time_limit_s: float = 5.0) -> Found:
+    """The findings by device and subject."""
+    results = check_devices(profile, time_limit_s)
+    return {(device, finding.subject): finding for device, findings in results.items() for finding in findings}
+
+
+def wrong(found: Found) -> list[tuple[str, str]]:
+    return [where for where, finding in found.items() if not finding.well]
+
+
+def test_what_is_well_is_told_in_a_table(drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--profile", str(drive_profile)]) == 0
     heading, *rows = capsys.readouterr().out.splitlines()
-    assert heading.startswith("device")
-    assert [row.split()[0] for row in rows] == ["laser/primary", "encoders", "rfid"]
-    assert [row.split()[2] for row in rows] == ["yes", "yes", "yes"]
-    assert "serial_number 18090362" in rows[0]
-    assert "US Digital A2" in rows[1]
-    assert "ALR" in rows[2]
+    assert heading.split() == ["device", "found", "what", "to", "do", "next"]
+    assert not [row for row in rows if " ok " not in row]
+    told = {" ".join(row.split(" ok ")[0].split()): row.split(" ok ")[1].strip() for row in rows}
+    assert "serial number 18090362, firmware" in told["laser/primary identity"]
+    assert told["laser/primary window"] == "clean"
+    assert told["laser/primary rate"].endswith("Hz, wanted 50.0")
+    assert told["laser/primary clock"].endswith("ms old by its stamp")
+    assert "US Digital A2, address 0" in told["encoders identity of left_wheel"]
+    assert told["encoders rate"].endswith("Hz, wanted 10.0")
+    assert "ALR-9650" in told["rfid identity"]
+    assert told["rfid antenna"].startswith("reads 0")
+    assert "s from this board's" in told["rfid clock"]
 
 
-def test_json_tells_the_same(drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_tells_each_row(drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--profile", str(drive_profile), "--json"]) == 0
-    answers = json.loads(capsys.readouterr().out)
-    assert all(answer["reachable"] and answer["advice"] == "" for answer in answers)
-    assert answers[0]["identity"]["serial_number"] == "18090362"
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["device"] for row in rows} == {"laser/primary", "encoders", "rfid"}
+    assert all(row["well"] and row["advice"] == "" for row in rows)
+    assert all(row.keys() == {"device", "subject", "found", "well", "advice"} for row in rows)
 
 
 def test_one_silent_encoder_is_named(drive: Any, drive_profile: Path) -> None:
     drive.encoders.mute(1)
     try:
-        results = {result.device: result for result in check_devices(load_profile(drive_profile))}
+        found = check(load_profile(drive_profile))
     finally:
         drive.encoders.mute(1, muted=False)
-    assert [device for device, result in results.items() if not result.reachable] == ["encoders"]
-    assert results["encoders"].message == "no answer from right_wheel"
-    assert "power" in results["encoders"].advice
+    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "connected")]
+    assert "address 1" in found["encoders", "identity of right_wheel"].advice
+    assert found["encoders", "connected"].found == "no answer from right_wheel"
 
 
 def test_a_device_that_takes_the_connection_and_says_nothing_is_away(drive: Any, drive_profile: Path) -> None:
     drive.laser.go_silent()
     try:
-        laser = check_devices(load_profile(drive_profile), time_limit_s=1.5)[0]
+        found = check(load_profile(drive_profile), time_limit_s=1.5)
     finally:
         drive.laser.go_silent(silent=False)
-    assert not laser.reachable
-    assert "answers neither" in laser.message
+    assert wrong(found) == [("laser/primary", "reachable")]
+    assert "answers neither" in found["laser/primary", "reachable"].found
+    assert "power" in found["laser/primary", "reachable"].advice
+
+
+def test_a_dirty_window_and_missing_scans_are_told_with_what_to_do(drive: Any, drive_profile: Path) -> None:
+    drive.laser.set_status(2)
+    drive.scan_s = 0.05
+    try:
+        found = check(load_profile(drive_profile))
+    finally:
+        drive.laser.set_status(0)
+        drive.scan_s = 0.02
+    assert wrong(found) == [("laser/primary", subject) for subject in ("window", "connected", "rate")]
+    assert found["laser/primary", "window"].found == "front window is dirty"
+    assert "clean" in found["laser/primary", "window"].advice
+    assert "cable" in found["laser/primary", "rate"].advice
+
+
+def test_a_reader_that_refuses_us_says_so(drive: Any, drive_profile: Path) -> None:
+    text = drive_profile.read_text()
+    port = drive.places["rfid_port"]
+    assert f"port = {port} }}" in text
+    found = check(parse_profile(text.replace(f"port = {port} }}", f'port = {port}, password = "wrong" }}'), "test"))
+    assert wrong(found) == [("rfid", "reachable")]
+    assert "password" in found["rfid", "reachable"].found
+
+
+def test_a_server_at_work_is_left_alone(drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = int(drive_profile.read_text().rsplit(":", 1)[1].split('"')[0])
+    with socket.create_server(("127.0.0.1", port)):
+        assert main(["check", "--profile", str(drive_profile)]) == 1
+    assert "the server is running" in capsys.readouterr().err
+
+
+def test_encoders_on_can_are_asked_by_their_driver(drive: Any, drive_profile: Path) -> None:
+    bus = CanBus(channel=str(drive_profile.parent), interface="virtual")
+    text, count = re.subn(
+        r"kind = .*\nport = .*",
+        f'kind = "can"\ninterface = "virtual"\nchannel = "{bus.channel}"',
+        drive_profile.read_text(),
+    )
+    assert count == 1
+    profile = parse_profile(text.replace("address = 0", "address = 5").replace("address = 1", "address = 9"), "test")
+    with CanBusEmulator(bus, {5: 4096, 9: 4096}, lambda _, now_ns: now_ns // 1_000_000) as emulator:
+        found = check(profile)
+        assert wrong(found) == []
+        assert "node 5" in found["encoders", "identity of left_wheel"].found
+        assert "no errors" in found["encoders", "bus"].found
+        emulator.mute(9)
+        found = check(profile)
+    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "connected")]
+    assert "node id 9" in found["encoders", "identity of right_wheel"].advice

@@ -1,0 +1,31 @@
+"""Are the encoders on the CAN bus well? In: what their driver knows after a few rounds. Out: rows for the table of
+`rtlog-server check`. A bus has no second place from which to ask: the driver itself asks each node who it is.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from hw_profiles.profile import CanBus, Encoder
+from rtlog_server.devices.finding import Finding
+
+
+def judge_bus(
+    bus: CanBus, encoders: Sequence[Encoder], identity: Mapping[str, str], diagnostics: Mapping[str, str]
+) -> list[Finding]:
+    """Rows from a driver's `identity` and `diagnostics`."""
+    findings = [_judge_controller(bus, diagnostics.get("controller", "not told"))]
+    for encoder in encoders:
+        subject, state = f"identity of {encoder.name}", diagnostics.get(encoder.name, "silent")
+        found = identity.get(encoder.name, f"node {encoder.address} has not told")
+        if state == "ok":
+            findings.append(Finding(subject, found))
+        else:
+            advice = f"its power and cable; is its node id {encoder.address}, its bit rate {bus.bitrate}?"
+            findings.append(Finding(subject, f"{found}: {state}", False, advice))
+    return findings
+
+
+def _judge_controller(bus: CanBus, state: str) -> Finding:
+    if state == "ok":
+        return Finding("bus", "the controller has reported no errors")
+    look = f"; ip -details -statistics link show {bus.channel}" if bus.interface == "socketcan" else ""
+    return Finding("bus", state, False, f"cable, terminators at both ends, the same bit rate everywhere{look}")
