@@ -35,7 +35,7 @@ class CanBusEmulator:
     """
 
     def __init__(self, bus: CanBus, encoders: Mapping[int, int], position: Callable[[int, int], int]) -> None:
-        self._bus = bus
+        self.bus = bus
         self.nodes = {
             node: EmulatedEncoder(node, counts_per_turn, lambda now_ns, node=node: position(node, now_ns))  # type: ignore[misc]
             for node, counts_per_turn in encoders.items()
@@ -100,12 +100,12 @@ class CanBusEmulator:
 
     def replug(self) -> None:
         """The encoders get their power, with the bus."""
-        slcan = self._bus.interface == "slcan"
-        self._port = SlcanAdapter(Path(self._bus.channel)) if slcan else CanPort(self._bus)
+        slcan = self.bus.interface == "slcan"
+        self._port = SlcanAdapter(Path(self.bus.channel)) if slcan else CanPort(self.bus)
         for node in self.nodes:
             self.power_cycle(node)
         self._unplugged.clear()
-        self._thread = threading.Thread(target=self._serve, name=f"CAN emulator {self._bus.place}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=f"CAN emulator {self.bus.place}", daemon=True)
         self._thread.start()
 
     # The thread
