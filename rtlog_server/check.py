@@ -80,7 +80,8 @@ def _check(device: Device[Any], place: Place, profile: Profile, grid: TickGrid, 
     try:
         return [*place.ask(), *watched]  # only now: a scanner tells its serial number when it measures
     except (DeviceError, OSError) as error:
-        return [Finding("reachable", str(error), False, place.advice)]
+        reason = str(error) if device.message == "connected" else device.message  # the driver tried more often
+        return [Finding("reachable", reason, False, place.advice)]
 
 
 def _watch(device: Device[Any], place: Place, grid: TickGrid, deadline: float) -> list[Finding]:
