@@ -58,8 +58,8 @@ def make_sweep(
 
 
 def _make_echo(ranges_m: ArrayLike, intensities: ArrayLike | None) -> Echo:
-    ranges = np.asarray(ranges_m, np.float64)
-    remission = None if intensities is None or np.size(intensities) == 0 else np.asarray(intensities, np.float64)
+    ranges = np.array(ranges_m, np.float64)  # copies: the caller may write the next sweep over this one
+    remission = None if intensities is None or np.size(intensities) == 0 else np.array(intensities, np.float64)
     if ranges.ndim != 1 or ranges.size > MAX_RAYS or (remission is not None and remission.shape != ranges.shape):
         raise ValueError("a sweep is one row of ranges, and as many intensities or none")
     return Echo(ranges, remission)

@@ -142,6 +142,17 @@ def test_a_scan_goes_to_who_asked_for_it_after_its_last_ray(emulator: Lms111Emul
     assert not emulator.wait_streaming(0)
 
 
+def test_a_sweep_may_be_written_over_once_it_is_given(emulator: Lms111Emulator, connect: Connect) -> None:
+    client = connect(emulator)
+    client.ask("sEN LMDscandata", 1)
+    ranges = np.full(3, 2.0)
+    emulator.send_scan(ranges, time.monotonic_ns() + 20 * MS, 0.0, STEP_RAD)
+    ranges[:] = 5.0
+    scan = client.next()
+    assert isinstance(scan, ScanData)
+    assert scan.channels16[0].data.tolist() == [2000, 2000, 2000]
+
+
 def test_remission_as_it_was_asked_for(emulator: Lms111Emulator, connect: Connect) -> None:
     client = connect(emulator)
     client.ask("sMN SetAccessMode", *AUTHORISED_CLIENT)

@@ -1,12 +1,15 @@
 """What a scanner says of a sweep, in metres, the scanner's frame and host time."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rtlog_server.devices.lms111.cola import ColaError, Dialect, Receiver
 from rtlog_server.devices.lms111.protocol import decode
@@ -47,6 +50,35 @@ def test_scale_and_offset() -> None:
     assert to_scan(scan_of(channel), TRANSMITTED_NS, 20_000).ranges_m.tolist() == pytest.approx(
         [math.inf, 0.23, math.nan], nan_ok=True
     )
+
+
+def test_what_lies_behind_the_scanner_is_no_range() -> None:
+    channel = replace(distances([0, 16, 100, 101]), scale_offset=-100.0)
+    assert to_scan(scan_of(channel), TRANSMITTED_NS, 20_000).ranges_m.tolist() == pytest.approx(
+        [math.inf, math.nan, math.nan, 0.001], nan_ok=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("echo", "ranges", "remission"),
+    [("first", [1.0, math.inf, 3.0, math.nan], [1, 2, 3, 4]), ("last", [5.0, 6.0, 3.0, math.nan], [50, 60, 3, 4])],
+)
+def test_the_first_or_the_last_echo(echo: str, ranges: list[float], remission: list[float]) -> None:
+    first, second = distances([1000, 0, 3000, 1]), replace(distances([5000, 6000, 0, 3]), content="DIST2")
+    rssi = [
+        Channel(f"RSSI{k}", 1.0, 0.0, 0, 5000, np.array(data, np.uint8))
+        for k, data in ((1, [1, 2, 3, 4]), (2, [50, 60, 0, 0]))
+    ]
+    scan = to_scan(replace(scan_of(first, second), channels8=tuple(rssi)), TRANSMITTED_NS, 20_000, echo)
+    np.testing.assert_array_equal(scan.ranges_m, np.array(ranges, np.float32))
+    assert scan.intensities.tolist() == remission
+    assert scan.ranges_m.dtype == scan.intensities.dtype == np.float32
+
+
+def test_second_echoes_without_remission_keep_the_first_ones() -> None:
+    first, second = distances([1000, 2000]), replace(distances([0, 6000]), content="DIST2")
+    rssi = Channel("RSSI1", 1.0, 0.0, 0, 5000, np.array([7, 8], np.uint16))
+    assert to_scan(scan_of(first, second, rssi), TRANSMITTED_NS, 20_000, "last").intensities.tolist() == [7, 8]
 
 
 def test_angles_are_the_scanner_frames() -> None:
@@ -100,14 +132,57 @@ def test_period() -> None:
     assert period_us(replace(after, scan_counter=3), before) == 20_000  # not its neighbour
     assert period_us(replace(after, time_since_startup_us=16_000), before) == 20_000  # no motor is 5 % slow
     assert period_us(replace(before, scan_counter=0), replace(before, scan_counter=65535)) == 20_000
-    with pytest.raises(ColaError, match="frequency"):
-        period_us(replace(after, scan_frequency_centihz=0), before)
+    for impossible in (0, 499, 10_001, 2**32 - 1):
+        with pytest.raises(ColaError, match="frequency"):
+            period_us(replace(after, scan_frequency_centihz=impossible), before)
 
 
 def test_no_distances_is_no_scan() -> None:
     for channels in ((), (distances([]),), (replace(distances([100]), content="RSSI1"),)):
         with pytest.raises(ColaError, match="DIST1"):
             to_scan(scan_of(*channels), TRANSMITTED_NS, 20_000)
+
+
+def test_as_many_second_echoes_as_first_ones() -> None:
+    with pytest.raises(ColaError, match="2 first and 1 second"):
+        to_scan(scan_of(distances([1, 2]), replace(distances([1]), content="DIST2")), TRANSMITTED_NS, 20_000, "last")
+
+
+@pytest.mark.parametrize(
+    ("scan", "message"),
+    [
+        (scan_of(distances(721 * [1000], start_1e4deg=0, step_1e4deg=5001)), "721 rays"),
+        (scan_of(distances([1000], step_1e4deg=0)), "steps of 0°"),
+        (scan_of(distances([1000], start_1e4deg=-3_600_001)), "from -360"),
+        (scan_of(distances([1000]), startup_us=0, transmission_us=5_000_001), "5.0 s after its sweep"),
+        (scan_of(distances([1000]), startup_us=1, transmission_us=0), "4295.0 s after its sweep"),
+    ],
+)
+def test_what_no_scanner_can_make_is_refused(scan: ScanData, message: str) -> None:
+    with pytest.raises(ColaError, match=message):
+        to_scan(scan, TRANSMITTED_NS, 20_000)
+
+
+@given(
+    raw=st.lists(st.integers(0, 65535), min_size=1, max_size=30),
+    start=st.integers(-(2**31), 2**31 - 1) | st.integers(-4_000_000, 4_000_000),
+    step=st.integers(0, 65535),
+    scale=st.floats(1e-6, 1e6),
+    offset=st.floats(-1e6, 1e6),
+    frequency=st.integers(0, 2**32 - 1) | st.integers(0, 20_000),
+    age_us=st.integers(0, 2**32 - 1) | st.integers(0, 100_000),
+)
+def test_no_scan_is_complete_before_it_came_or_long_before(
+    raw: list[int], start: int, step: int, scale: float, offset: float, frequency: int, age_us: int
+) -> None:
+    channel = replace(distances(raw, start, step, scale), scale_offset=offset)
+    data = replace(scan_of(channel, transmission_us=age_us), scan_frequency_centihz=frequency)
+    with suppress(ColaError):
+        scan = to_scan(data, TRANSMITTED_NS, period_us(data, None))
+        assert scan.measured_ns <= scan.complete_ns <= TRANSMITTED_NS
+        assert TRANSMITTED_NS - scan.measured_ns < 6e9
+        assert not (scan.ranges_m <= 0).any()
+        assert 0.009 < scan.scan_time_s < 0.21
 
 
 def test_sweep_geometry() -> None:
