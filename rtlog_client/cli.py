@@ -1,4 +1,4 @@
-"""rtlog-client record | recover | replay | audit: the laptop's commands. Only here is anything printed."""
+"""rtlog-client record | recover | audit | replay | compare: the laptop's commands. Only here is anything printed."""
 
 import argparse
 import json
@@ -16,6 +16,7 @@ from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
 from rtlog_client.audit import audit
+from rtlog_client.compare import compare_recordings
 from rtlog_client.faults import load_faults
 from rtlog_client.live_line import LiveLine
 from rtlog_client.log_file import read_info
@@ -23,7 +24,9 @@ from rtlog_client.record import record
 from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
 from rtlog_client.recover import recover
 from rtlog_client.replay import NO_FAULTS, serve_devices
+from rtlog_client.replay_report import load_report
 from rtlog_client.republish import republish
+from rtlog_server.realtime import become_realtime
 
 RATE_HELP = "so many times as fast, or max: one recorded tick for each tick of the profile; default: 1"
 
@@ -62,6 +65,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("--duration", type=_seconds, metavar="S", help="default: to the end")
     verb.add_argument("--rate", type=_rate, default=1.0, metavar="R", help=f"to devices: {RATE_HELP}")
     verb.add_argument("--faults", type=Path, metavar="FILE.toml", help="to devices: what goes wrong at the wire, when")
+
+    example = "rtlog-client compare recordings/a.mcap recordings/a_again.mcap --replay replay.json"
+    summary = "is what came out of a replay to devices what went in? status 1 if not, and no fault explains it"
+    verb = add_verb(verbs, "compare", _compare, summary, example)
+    verb.add_argument("went_in", type=Path, metavar="IN.mcap")
+    verb.add_argument("came_out", type=Path, metavar="OUT.mcap")
+    replay_help = "what the replay printed: its clock and its faults; default: both have one clock"
+    verb.add_argument("--replay", type=Path, metavar="REPORT.json", help=replay_help)
+    verb.add_argument("--json", action="store_true", help="every difference as JSON")
 
     return run_verbs(parser, argv)
 
@@ -150,12 +162,20 @@ def _replay(args: argparse.Namespace) -> None:
     faults = load_faults(args.faults) if args.faults is not None else NO_FAULTS
     stopping, part = _stop_on_signals(), {"start_s": args.start, "duration_s": args.duration}
     if args.to == "devices":
+        become_realtime()  # before the emulators' threads: a device does not wait for this machine's other work
         report = serve_devices(args.recording, profile, stopping, **part, rate=args.rate, faults=faults)
         print(report.to_json())
     elif args.rate != 1.0 or args.faults is not None:
         raise BadInputError("--rate and --faults are for --to devices")
     else:
         print(json.dumps(asdict(republish(args.recording, profile, profile_toml, stopping, **part))))
+
+
+def _compare(args: argparse.Namespace) -> int:
+    report = load_report(args.replay) if args.replay is not None else None
+    comparison = compare_recordings(args.went_in, args.came_out, report)
+    print(comparison.to_json() if args.json else "\n".join(comparison.lines()))
+    return 0 if comparison.same else 1
 
 
 if __name__ == "__main__":

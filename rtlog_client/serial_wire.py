@@ -17,21 +17,22 @@ SPEEDS = slice(4, 6)  # of tcgetattr's list: input and output speed
 
 
 class SerialWire(Wire):
-    """Between `link`, the name under which hosts open the port, and the emulator's terminal `target`.
-
-    Raises:
-        OSError: the link cannot be made, or there is no such terminal.
-    """
+    """Between `link`, the name under which hosts open the port, and the emulator's terminal `target`."""
 
     def __init__(self, name: str, link: Path, target: Path, seed: int = 0) -> None:
         super().__init__(name, seed)
         self._link = link
-        self._device = os.open(target, os.O_RDWR | os.O_NOCTTY)
+        self._target = target
+
+    # In the thread
+
+    def _open(self) -> None:
+        if self._link.exists() and not self._link.is_symlink():
+            raise FileExistsError(f"{self._link} is in the way and no symbolic link")
+        self._device = os.open(self._target, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._device)
         self._plug_in()
         self._watch(self._device, self._receive_from_device)
-
-    # In the thread
 
     def _begin(self, fault: Fault) -> None:
         self.fault = fault
@@ -44,8 +45,6 @@ class SerialWire(Wire):
             self._plug_in()
 
     def _plug_in(self) -> None:
-        if self._link.exists() and not self._link.is_symlink():
-            raise FileExistsError(f"{self._link} is in the way and no symbolic link")
         self._host, self._port = os.openpty()  # the port stays open: without any, the host's end reads EIO
         tty.setraw(self._port)
         os.set_blocking(self._host, False)

@@ -5,23 +5,32 @@ and tag reads are given. A device without faults stands at its address itself; o
 """
 
 import math
+import socket
 import tempfile
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
+
+from msgspec.structs import replace
 
 from hw_profiles.errors import BadInputError, RTLogError
-from hw_profiles.profile import Encoder, LaserDevice, Profile, RfidDevice, SeiBus
+from hw_profiles.profile import CanBus, Encoder, LaserDevice, Profile, RfidDevice, SeiBus
+from rtlog_client.can_wire import CanWire
 from rtlog_client.serial_wire import SerialWire
 from rtlog_client.tcp_wire import TcpWire
 from rtlog_client.wire import Wire
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
+from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.devices.encoders import counts_at
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 
+if TYPE_CHECKING:
+    from rtlog_server.devices.cia406.emulator import CanBusEmulator
+
+LOOPBACK = "127.0.0.1"
 Angle = Callable[[str, int], float]  # encoder, monotonic ns → rad
 
 
@@ -73,10 +82,10 @@ class Stage:
                 with _located(f"{laser.host}:{laser.port}"):
                     self._open_laser(name, laser)
             if profile.encoder_bus is not None:
-                with _located(profile.encoder_bus.port):
+                with _located(profile.encoder_bus.place):
                     self._open_encoders(profile.encoder_bus, profile.encoders, angle)
             if profile.rfid is not None and profile.rfid.device is not None:
-                with _located(f"{profile.rfid.device.host}:{profile.rfid.device.port}"):
+                with _located(profile.rfid.device.place):
                     self._open_reader(profile.rfid.device)
             self._stack = stack.pop_all()
 
@@ -86,57 +95,88 @@ class Stage:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _tcp_wire(self, name: str, host: str, port: int) -> TcpWire | None:
-        if name not in self._faulty:
-            return None
-        return self._stack.enter_context(TcpWire(name, (host, port), self._seed))
-
     def _open_laser(self, name: str, laser: LaserDevice) -> None:
-        wire = self._tcp_wire(name, laser.host, laser.port)
-        emulator = Lms111Emulator(laser.host, laser.port) if wire is None else Lms111Emulator()
+        faulty = name in self._faulty
+        emulator = Lms111Emulator() if faulty else Lms111Emulator(laser.host, laser.port)
         self.lasers[name] = self._stack.enter_context(emulator)
-        if wire is not None:
+        if faulty:
+            wire = TcpWire(name, (laser.host, laser.port), self._seed)
             wire.device = emulator.address
-            self.lines[name] = Line(wire, lambda: emulator.power_cycle(off_s=0.0))
+            self._lead(name, wire, lambda: emulator.power_cycle(off_s=0.0))
 
     def _open_reader(self, device: RfidDevice) -> None:
-        wire = self._tcp_wire("rfid", device.host, device.port)
         login = device.username, device.password
-        if wire is None:
-            self.reader = self._stack.enter_context(Alr9650Emulator(device.host, device.port, *login))
-            return
-        reader = self.reader = self._stack.enter_context(Alr9650Emulator("127.0.0.1", 0, *login, connect=wire.dial))
-        wire.device = "127.0.0.1", reader.port
+        wire: Wire | None = None
+        if "rfid" not in self._faulty:
+            link = Path(device.serial_port) if device.serial_port else None
+            reader = Alr9650Emulator(device.host or LOOPBACK, device.port if link is None else 0, *login, link=link)
+        elif device.serial_port:
+            port = self._hidden("rfid")
+            reader = Alr9650Emulator(link=port)
+            wire = SerialWire("rfid", Path(device.serial_port), port, self._seed)
+        else:
+            wire = tcp = TcpWire("rfid", (device.host, device.port), self._seed)
+            reader = Alr9650Emulator(LOOPBACK, 0, *login, connect=tcp.dial)
+            tcp.device = LOOPBACK, reader.port
+        self.reader = self._stack.enter_context(reader)
 
         def power_cycle() -> None:
             reader.power_off()
             reader.power_on()
 
-        self.lines["rfid"] = Line(wire, power_cycle)
+        if wire is not None:
+            self._lead("rfid", wire, power_cycle)
 
-    def _open_encoders(self, bus: SeiBus, fitted: list[Encoder], angle: Angle) -> None:
+    def _open_encoders(self, bus: SeiBus | CanBus, fitted: list[Encoder], angle: Angle) -> None:
         encoders = {encoder.address: encoder for encoder in fitted if encoder.address is not None}
+        counts = {address: encoder.counts_per_turn for address, encoder in encoders.items()}
 
         def position(address: int, at_ns: int) -> int:
             encoder = encoders[address]
             return total_counts(encoder, angle(encoder.name, at_ns))
 
-        counts = {address: encoder.counts_per_turn for address, encoder in encoders.items()}
-        port = Path(bus.port)
-        faulty = "encoders" in self._faulty
-        if faulty:
-            port = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="rtlog-"))) / "encoders"
-        emulator = SeiBusEmulator(port, counts, position, bus.echo == "yes", bus.turns == "multi")
+        there = self._behind_wire(bus) if "encoders" in self._faulty else bus
+        emulator: SeiBusEmulator | CanBusEmulator
+        if isinstance(there, SeiBus):
+            echo, multi_turn = there.echo == "yes", there.turns == "multi"
+            emulator = SeiBusEmulator(Path(there.port), counts, position, echo, multi_turn)
+        else:
+            emulator = CanBusEmulator(there, counts, position)
         self._stack.enter_context(emulator)
-        if not faulty:
-            return
 
         def power_cycle() -> None:
             for address in counts:
                 emulator.power_cycle(address)
 
-        wire = self._stack.enter_context(SerialWire("encoders", Path(bus.port), port, self._seed))
-        self.lines["encoders"] = Line(wire, power_cycle)
+        if there is not bus:
+            self._lead("encoders", self._bus_wire(bus, there), power_cycle)
+
+    def _behind_wire(self, bus: SeiBus | CanBus) -> SeiBus | CanBus:
+        """Where the emulated encoders are, if there is to be a wire between them and the host's bus."""
+        if isinstance(bus, SeiBus):
+            return replace(bus, port=str(self._hidden("encoders")))
+        if bus.interface == "slcan":
+            return replace(bus, channel=str(self._hidden("encoders")))
+        if bus.interface == "udp_multicast":
+            return replace(bus, udp_port=_free_udp_port())
+        raise BadInputError(f"faults of encoders on {bus.interface}: only slcan and udp_multicast have a wire to spoil")
+
+    def _bus_wire(self, bus: SeiBus | CanBus, there: SeiBus | CanBus) -> Wire:
+        match bus, there:
+            case SeiBus(), SeiBus():
+                return SerialWire("encoders", Path(bus.port), Path(there.port), self._seed)
+            case CanBus(interface="slcan"), CanBus():
+                return SerialWire("encoders", Path(bus.channel), Path(there.channel), self._seed)
+            case CanBus(), CanBus():
+                return CanWire("encoders", bus, there.udp_port, self._seed)
+        raise AssertionError((bus, there))
+
+    def _lead(self, device: str, wire: Wire, power_cycle: Callable[[], None]) -> None:
+        self.lines[device] = Line(self._stack.enter_context(wire), power_cycle)
+
+    def _hidden(self, name: str) -> Path:
+        """Where an emulator's terminal stands behind its wire."""
+        return Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="rtlog-"))) / name
 
 
 @contextmanager
@@ -146,6 +186,12 @@ def _located(where: str) -> Iterator[None]:
     except OSError as error:
         hint = "the profile must name addresses of this machine that are free"
         raise RTLogError(f"{where}: {error.strerror or error}; {hint}") from error
+
+
+def _free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
 
 
 def total_counts(encoder: Encoder, angle_rad: float) -> int:

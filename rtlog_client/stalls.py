@@ -1,16 +1,19 @@
-"""When did this process not get to run? A thread wakes up every few milliseconds; what it slept too long is a stall.
+"""When did this machine stand still? A byte is sent through a pseudo-terminal every few milliseconds, and timed.
 
-In: nothing. Out: `Stall`s. A replay that stood still gave its devices no time to answer, which is no fault of theirs.
+In: nothing. Out: `Stall`s. The byte needs a turn of this thread and one of the kernel's terminal worker, as what a
+device on a serial line sends does; what it waits for either, no device and no driver can help.
 """
 
+import os
 import threading
 import time
+import tty
 from typing import Self
 
 from rtlog_client.replay_report import Stall
 
-STEP_NS = 5_000_000
-STALL_NS = 5_000_000  # that it slept longer
+STEP_S = 0.002
+STALL_NS = 2_000_000  # longer than a byte should take and this thread should sleep
 MAX_STALLS = 100_000
 
 
@@ -32,10 +35,15 @@ class StallWatch:
         self._thread.join()
 
     def _run(self) -> None:
-        due_ns = time.monotonic_ns() + STEP_NS
+        into, out = os.openpty()
+        tty.setraw(out)
         while not self._stopping.is_set() and len(self.stalls) < MAX_STALLS:
-            time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
-            woken_ns = time.monotonic_ns()
-            if woken_ns - due_ns > STALL_NS:
-                self.stalls.append(Stall(due_ns + self._utc_offset_ns, woken_ns + self._utc_offset_ns))
-            due_ns = woken_ns + STEP_NS
+            began_ns = time.monotonic_ns()
+            os.write(into, b"\0")
+            os.read(out, 1)
+            time.sleep(STEP_S)
+            ended_ns = time.monotonic_ns()
+            if ended_ns - began_ns > STALL_NS + round(STEP_S * 1e9):
+                self.stalls.append(Stall(began_ns + self._utc_offset_ns, ended_ns + self._utc_offset_ns))
+        os.close(into)
+        os.close(out)

@@ -44,21 +44,15 @@ def reset(connection: socket.socket) -> None:
 
 
 class TcpWire(Wire):
-    """Between `address`, where hosts connect to, and `device`, where the device listens.
-
-    Raises:
-        OSError: the address is taken.
-    """
+    """Between `address`, where hosts connect to (port 0: any), and `device`, where the device listens."""
 
     def __init__(self, name: str, address: Address, seed: int = 0) -> None:
         super().__init__(name, seed)
         self.device: Address = ("", 0)  # to be set before the first host comes
         self._crossed: Address | None = None
-        self._listener = socket.create_server(address)
-        self.address: Address = self._listener.getsockname()[:2]
+        self.address = address
         self._outward: dict[Address, socket.socket] = {}  # where a host listens: where its device connects to instead
         self._links: list[_Link] = []
-        self._watch(self._listener, self._accept)
 
     def dial(self, address: Address, timeout: float) -> socket.socket:
         """Connect as the device, through the wire, to a host that listens at `address`. Raises: OSError."""
@@ -70,6 +64,11 @@ class TcpWire(Wire):
         self._call(lambda: setattr(self, "_crossed", other.device))
 
     # In the thread
+
+    def _open(self) -> None:
+        self._listener = socket.create_server(self.address)
+        self.address = self._listener.getsockname()[:2]
+        self._watch(self._listener, self._accept)
 
     def _begin(self, fault: Fault) -> None:
         self.fault = fault
@@ -90,8 +89,7 @@ class TcpWire(Wire):
         if fault.kind == "cut":
             self._resume()
         elif fault.kind == "restart":
-            self._listener = socket.create_server(self.address)
-            self._watch(self._listener, self._accept)
+            self._open()
         elif fault.kind == "swap":
             self._crossed = None
             self._reset_all()

@@ -18,6 +18,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, Self
 
 from rtlog_client.faults import Fault
@@ -25,19 +26,12 @@ from rtlog_client.faults import Fault
 READ_BYTES = 65536
 
 
-def bend(data: bytes, fault: Fault | None, noise: random.Random) -> bytes:
-    """What is left of `data` from a device under a fault of the bytes."""
-    if fault is None or not data:
-        return data
-    if fault.kind == "drop":
-        return b""
-    if fault.kind == "garble" and fault.share is not None:
-        return bytes(byte ^ noise.randrange(1, 256) if noise.random() < fault.share else byte for byte in data)
-    return data
-
-
 class Wire(ABC):
-    """A thread that owns the wire's state; everything else asks it. A context manager."""
+    """A thread that owns the wire's state; everything else asks it. A context manager.
+
+    Raises:
+        OSError, DeviceError: on entering: an address is taken, or not there.
+    """
 
     def __init__(self, name: str, seed: int) -> None:
         self.fault: Fault | None = None
@@ -50,15 +44,18 @@ class Wire(ABC):
         self._thread = threading.Thread(target=self._run, name=f"wire {name}", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        with ExitStack() as stack:
+            for opened in (self._wake, self._waker, self._selector):
+                stack.callback(opened.close)
+            self._open()
+            self._thread.start()
+            self._opened = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._call(self._close)
         self._thread.join()
-        self._wake.close()
-        self._waker.close()
-        self._selector.close()
+        self._opened.close()
 
     def begin(self, fault: Fault) -> None:
         self._call(lambda: self._begin(fault))
@@ -67,6 +64,22 @@ class Wire(ABC):
         self._call(self._end)
 
     # In the thread
+
+    def bend(self, data: bytes) -> bytes:
+        """What is left of `data` from the device under the fault at hand."""
+        fault = self.fault
+        if fault is not None and fault.kind == "drop":
+            return b""
+        if fault is not None and fault.kind == "garble":
+            return bytes(byte ^ self.noise.randrange(1, 256) if self._hit(fault) else byte for byte in data)
+        return data
+
+    def _hit(self, fault: Fault) -> bool:
+        return self.noise.random() < (fault.share or 0.0)
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Take the wire's addresses, before the thread starts. Raises: OSError, DeviceError."""
 
     @abstractmethod
     def _begin(self, fault: Fault) -> None: ...
@@ -124,10 +137,9 @@ class Flow:
     def put(self, data: bytes, wire: Wire) -> None:
         due_s = time.monotonic()
         if self._from_device:
-            fault = wire.fault
-            if data and not (data := bend(data, fault, wire.noise)):
+            if data and not (data := wire.bend(data)):
                 return
-            due_s += fault.by_s or 0.0 if fault is not None else 0.0
+            due_s += wire.fault.by_s or 0.0 if wire.fault is not None else 0.0
         self._waiting.append((max(due_s, self._waiting[-1][0] if self._waiting else 0.0), data))
 
     def flush(self) -> float | None:

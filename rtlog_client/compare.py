@@ -1,0 +1,114 @@
+"""Compare the recording that went in at the wire with the one that came out: what is the same, what not, and why.
+
+In: two recordings, and what the replay said of itself (without: their clocks are the same). Out: a `Comparison`. The
+law: every sample that went in is the same, superseded by a newer one in its tick, or a `Difference` with its cause.
+"""
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hw_profiles.errors import BadInputError
+from hw_profiles.profile import Profile, parse_profile
+from rtlog_client.compare_encoders import compare_encoders
+from rtlog_client.compare_scans import compare_scans
+from rtlog_client.compare_tags import compare_tags
+from rtlog_client.difference import Causes, DeviceComparison, fault_causes, stall_causes
+from rtlog_client.drive_log import TOPICS, Span, read_span
+from rtlog_client.encoder_track import read_encoder_track
+from rtlog_client.log_file import LogInfo, read_info
+from rtlog_client.replay_report import ReplayReport
+from rtlog_client.stage import addressed_lasers
+from rtlog_client.ticks_out import TicksOut, read_ticks
+from rtlog_server.topics import JOINT_STATES, ODOMETRY, TAGS
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    came_out: Path
+    ticks: int  # recorded
+    missing_ticks: int  # between the first and the last of them
+    overruns: int  # ticks that began a whole period late or more
+    devices: list[DeviceComparison]
+
+    @property
+    def same(self) -> bool:
+        """Nothing differs but by what has a cause."""
+        return not self.missing_ticks and not any(device.unexplained for device in self.devices)
+
+    def to_json(self) -> str:
+        answer: dict[str, Any] = {
+            "same": self.same,
+            "came_out": str(self.came_out),
+            "ticks": self.ticks,
+            "missing_ticks": self.missing_ticks,
+            "overruns": self.overruns,
+            "devices": [asdict(device) for device in self.devices],
+        }
+        return json.dumps(answer)
+
+    def lines(self) -> list[str]:
+        """For people: a line a device, then how often what happened, and why."""
+        lines = [f"{self.ticks} ticks, {self.missing_ticks} missing, {self.overruns} a period late or more"]
+        lines.append(f"{'device':18}{'went in':>9}{'same':>9}{'superseded':>12}{'differ':>8}{'unexplained':>13}")
+        for device in self.devices:
+            counts = f"{device.went_in:9}{device.same:9}{device.superseded:12}{len(device.differences):8}"
+            lines.append(f"{device.device:18}{counts}{len(device.unexplained):13}")
+        for device in self.devices:
+            lines += [f"{device.device}: {key} {value:g}" for key, value in device.figures.items()]
+            tally = Counter((d.what, d.cause) for d in device.differences)
+            first = {(d.what, d.cause): d for d in reversed(device.differences)}
+            for (what, cause), count in sorted(tally.items()):
+                example = first[what, cause]
+                detail = f" ({example.detail})" if example.detail else ""
+                reason = cause or "UNEXPLAINED"
+                lines.append(f"{device.device}: {count} {what}, from tick {example.tick}{detail}: {reason}")
+        return lines
+
+
+def compare_recordings(went_in: Path, came_out: Path, report: ReplayReport | None = None) -> Comparison:
+    """Raises: BadInputError: one of them is no recording, is empty, or has no profile where one is needed."""
+    info_in, info_out = read_info(went_in), read_info(came_out)
+    whole = read_span(went_in, 0.0, None)
+    if report is None:
+        report = ReplayReport(0, whole.start_ns, whole.end_ns, 0, 0, 0)
+    span = Span(report.start_ns, report.end_ns, whole.first_tick_ns)
+    profile = _profile(came_out, info_out)
+    ticks = read_ticks(came_out)
+    causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
+    missing = int((~ticks.recorded).sum())
+    overruns = int((ticks.lateness_s * 1e9 >= ticks.period_ns).sum())
+    devices = list(_compare_devices((went_in, span), info_in, came_out, profile, report, ticks, causes))
+    return Comparison(came_out, int(ticks.recorded.sum()), missing, overruns, devices)
+
+
+def _compare_devices(
+    went_in: tuple[Path, Span],
+    info_in: LogInfo,
+    came_out: Path,
+    profile: Profile,
+    report: ReplayReport,
+    ticks: TicksOut,
+    causes: Causes,
+) -> list[DeviceComparison]:
+    """Of each device that the profile has and the input tells of."""
+    there = info_in.message_counts
+    devices = []
+    for name, laser in addressed_lasers(profile).items():
+        if any(there.get(topic) for topic in TOPICS[name]):
+            turn_s = 1 / laser.scan_frequency_hz
+            devices.append(compare_scans(name, went_in, came_out, report, ticks, causes, turn_s))
+    if profile.encoders and (there.get(JOINT_STATES.name) or there.get(ODOMETRY.name)):
+        track = read_encoder_track(went_in[0], profile)
+        devices.append(compare_encoders(track, profile.encoders, came_out, report, ticks, causes))
+    if profile.rfid is not None and there.get(TAGS.name):
+        devices.append(compare_tags(went_in, came_out, report, ticks, causes))
+    return devices
+
+
+def _profile(recording: Path, info: LogInfo) -> Profile:
+    if info.profile_toml is None:
+        raise BadInputError(f"{recording}: no profile in it; a recording of our server is wanted here")
+    return parse_profile(info.profile_toml, f"in {recording}")

@@ -1,0 +1,309 @@
+"""Hardware in the loop: a rig of the real server process, the real recorder, and devices, emulated or real.
+
+    recording ── rtlog-client replay --to devices ══ wires ══ rtlog-server run ── zenoh ── rtlog-client record
+                                    or real devices, with --hw-profile FILE
+
+A test asks for `rig`, plays drives with faults through it and compares; or for `vehicle`, whose devices may be real.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtlog_client.log_file import LogWriter
+from rtlog_server.messages import (
+    OK,
+    JointState,
+    LaserScan,
+    SensorState,
+    TagRead,
+    TagReads,
+    Tick,
+    encode,
+    header,
+    to_time,
+)
+from rtlog_server.topics import AUXILIARY_SCAN, JOINT_STATES, PRIMARY_SCAN, TAGS, TICK
+
+START_NS = 1_700_000_000_000_000_000 + 37_000_000  # its ticks are not on whole tenths of a second
+PERIOD_NS = 100_000_000
+TURN_NS = 20_000_000  # of a scanner's head
+SWEEP_NS = 15_000_000
+BEFORE_TICK_NS = 10_000_000  # when the newest sweep of a tick is complete
+LATCHED_NS = 12_000_000
+READ_NS = 40_000_000  # before the tick
+BEAMS = 541
+EPCS = ("E2003411B802011526370494", "E2003411B802011526370495")
+NOTHING = np.empty(0)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hw-profile", type=Path, metavar="FILE", help="run on the real devices of this profile")
+    parser.addoption("--soak-s", type=float, default=1200.0, metavar="S", help="length of the soak; default: 20 min")
+
+
+# A drive
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the vehicle does: it weaves ahead, and each tag is read for a second in five.
+
+    `scan_hz` 10: the scan of each tick, as our server records it; 50: all that a scanner measures.
+    """
+
+    seconds: float
+    scan_hz: int = 10
+    lasers: tuple[Any, ...] = (PRIMARY_SCAN,)
+
+    def write(self, path: Path) -> None:
+        base = np.random.default_rng(1).integers(500, 15_000, BEAMS).astype(np.float32)
+        with LogWriter(path, {"vehicle": "bench"}, None) as log:
+            for k in range(round(self.seconds * 1e9) // PERIOD_NS):
+                tick_ns = START_NS + k * PERIOD_NS
+                for topic, message, log_ns in [*self._scans(k, tick_ns, base), *_tick(k, tick_ns)]:
+                    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                    log.write(topic.name, topic.msgtype, encode(message), log_ns, stamp_ns)
+
+    def _scans(self, k: int, tick_ns: int, base: Any) -> Iterator[tuple[Any, Any, int]]:
+        per_tick = self.scan_hz // 10
+        for part in range(per_tick):
+            first_ns = tick_ns - BEFORE_TICK_NS - SWEEP_NS - (per_tick - 1 - part) * TURN_NS
+            for number, topic in enumerate(self.lasers):
+                count = (k * per_tick + part) * len(self.lasers) + number
+                millimetres = np.roll(base, 7 * count)
+                millimetres[count % BEAMS] = np.inf
+                millimetres[0] = 1000 + count % 20_000  # no two within a while are alike
+                scan = LaserScan(
+                    header(first_ns, "laser"),
+                    *(np.radians(-135.0), np.radians(135.0), np.radians(0.5), 0.02 / 720, 0.02, 0.016, 20.0),
+                    *(millimetres / np.float32(1000), np.float32(NOTHING)),
+                )
+                yield topic, scan, tick_ns if self.scan_hz == 10 else first_ns + SWEEP_NS
+
+
+def wheel_angles(elapsed_s: float) -> list[float]:
+    """Left and right, rad: a metre a second or so, never twice the same."""
+    return [3.0 * elapsed_s + np.sin(elapsed_s), 3.0 * elapsed_s - 1.5 * np.sin(0.7 * elapsed_s)]
+
+
+def _tick(k: int, tick_ns: int) -> Iterator[tuple[Any, Any, int]]:
+    latched_ns = tick_ns - LATCHED_NS
+    angles = np.array(wheel_angles((latched_ns - START_NS) * 1e-9))
+    read = TagRead(to_time(tick_ns - READ_NS), EPCS[k // 50 % 2], 0, 1 + k % 3, -40.0 - k % 10)
+    reads = [read] if k % 50 < 10 else []
+    sensors = [SensorState(name, OK, 0.02) for name in ("laser/primary", "encoders", "rfid")]
+    yield TICK, Tick(header(tick_ns, ""), k, to_time(tick_ns), 0.0, sensors), tick_ns
+    yield (
+        JOINT_STATES,
+        JointState(header(latched_ns, ""), ["left_wheel", "right_wheel"], angles, NOTHING, NOTHING),
+        tick_ns,
+    )
+    yield TAGS, TagReads(header(tick_ns, "rfid"), reads), tick_ns
+
+
+# The rig
+
+
+@dataclass
+class Played:
+    """A drive that went through the rig."""
+
+    report: dict[str, Any]  # of the replay
+    summary: dict[str, Any]  # of the recorder
+    came_out: Path
+    comparison: dict[str, Any]
+    status: int  # of rtlog-client compare
+    log: str = ""  # of the server
+
+    def device(self, name: str) -> dict[str, Any]:
+        return next(device for device in self.comparison["devices"] if device["device"] == name)
+
+    def causes(self, name: str, what: str) -> list[str]:
+        return [d["cause"] for d in self.device(name)["differences"] if d["what"] == what]
+
+    def unexplained(self) -> list[dict[str, Any]]:
+        return [d for device in self.comparison["devices"] for d in device["differences"] if not d["cause"]]
+
+
+@dataclass
+class Process:
+    """A command of ours, its words on stderr kept."""
+
+    popen: subprocess.Popen[str]
+    lines: list[str] = field(default_factory=list)
+    _news: threading.Condition = field(default_factory=threading.Condition)
+
+    def listen(self) -> None:
+        assert self.popen.stderr is not None
+        for line in self.popen.stderr:
+            with self._news:
+                self.lines.append(line)
+                self._news.notify_all()
+        with self._news:
+            self._news.notify_all()
+
+    def wait_for(self, word: str, timeout_s: float = 30.0) -> None:
+        with self._news:
+            if not self._news.wait_for(lambda: any(word in line for line in self.lines), timeout_s):
+                pytest.fail(f"no {word!r} in {''.join(self.lines)}")
+
+    def finish(self, timeout_s: float) -> str:
+        """Its answer on stdout, once it has ended by itself."""
+        assert self.popen.stdout is not None
+        answer = self.popen.stdout.read()
+        assert self.popen.wait(timeout_s) == 0, "".join(self.lines)
+        return answer
+
+
+@contextmanager
+def command(module: str, *arguments: object) -> Iterator[Process]:
+    pipe = subprocess.PIPE
+    line = [sys.executable, "-m", module, *map(str, arguments)]
+    with subprocess.Popen(line, stdout=pipe, stderr=pipe, text=True, cwd=Path(__file__).parents[2]) as popen:
+        process = Process(popen)
+        listener = threading.Thread(target=process.listen)
+        listener.start()
+        try:
+            yield process
+        finally:
+            popen.terminate()
+            listener.join()
+
+
+def free_ports(count: int) -> list[int]:
+    probes = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [probe.getsockname()[1] for probe in probes]
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+class Rig:
+    """A folder, a profile at addresses of its own, and the commands."""
+
+    def __init__(self, folder: Path, tick_period_s: float = 0.1, auxiliary: bool = False) -> None:
+        self.folder = folder
+        primary, second, rfid, zenoh = free_ports(4)
+        self.endpoint = f"tcp/127.0.0.1:{zenoh}"
+        self.profile = folder / "bench.toml"
+        other = f'[lasers.auxiliary]\ndevice = {{ host = "127.0.0.1", port = {second} }}' if auxiliary else ""
+        self.profile.write_text(f"""
+            schema = 1
+            name = "bench"
+            tick_period_s = {tick_period_s}
+            vehicle = {{ kinematics = "differential", track_width_m = 1.6 }}
+            encoder_bus = {{ kind = "sei", port = "{folder}/sei" }}
+            rfid = {{ model = "ALR-9650", device = {{ host = "127.0.0.1", port = {rfid} }} }}
+            zenoh = {{ listen = ["{self.endpoint}"] }}
+            [lasers.primary]
+            device = {{ host = "127.0.0.1", port = {primary} }}
+            {other}
+            [[encoders]]
+            name = "left_wheel"
+            role = "left_wheel"
+            wheel_radius_m = 0.35
+            address = 0
+            [[encoders]]
+            name = "right_wheel"
+            role = "right_wheel"
+            wheel_radius_m = 0.35
+            reversed = true
+            address = 1
+            """)
+
+    @contextmanager
+    def running(self) -> Iterator[tuple[Process, Process]]:
+        """The server and the recorder, which has begun to write."""
+        with (
+            command("rtlog_server.cli", "run", "--profile", self.profile) as server,
+            command(
+                "rtlog_client.cli",
+                *("record", "-o", self.folder, "--name", "out", "--connect", self.endpoint, "--json"),
+            ) as recorder,
+        ):
+            recorder.wait_for("writing")
+            yield server, recorder
+
+    def play(self, recording: Path, faults: str = "", *options: object) -> Played:
+        """Replay, record and compare."""
+        with ExitStack() as stack:
+            server, recorder = stack.enter_context(self.running())
+            replay = stack.enter_context(self.replay(recording, faults, *options))
+            report = replay.finish(timeout_s=60)
+            recorder.popen.send_signal(signal.SIGINT)
+            summary = recorder.finish(timeout_s=30)
+            server.popen.terminate()
+            server.finish(timeout_s=30)
+        return self.compare(recording, report, summary, "".join(server.lines))
+
+    def replay(self, recording: Path, faults: str, *options: object) -> Any:
+        script: list[object] = []
+        if faults:
+            (self.folder / "faults.toml").write_text(faults)
+            script = ["--faults", self.folder / "faults.toml"]
+        to_devices = ("--to", "devices", "--profile", self.profile)
+        return command("rtlog_client.cli", "replay", recording, *to_devices, *script, *options)
+
+    def compare(self, recording: Path, report: str, summary: str, log: str) -> Played:
+        (self.folder / "replay.json").write_text(report)
+        out = self.folder / "out.mcap"
+        line = ["compare", recording, out, "--replay", self.folder / "replay.json", "--json"]
+        compared = subprocess.run(
+            [sys.executable, "-m", "rtlog_client.cli", *map(str, line)],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=Path(__file__).parents[2],
+        )
+        assert compared.returncode in (0, 1), compared.stderr
+        told = json.loads(report), json.loads(summary)[0]
+        return Played(*told, out, json.loads(compared.stdout), compared.returncode, log)
+
+
+@pytest.fixture
+def emulated(request: pytest.FixtureRequest) -> None:
+    """Of tests that do to a device what cannot be done to a real one."""
+    if request.config.getoption("--hw-profile") is not None:
+        pytest.skip("on real devices nobody pulls cables or plays a known drive: this runs on emulators only")
+
+
+@pytest.fixture
+def rig(emulated: None, tmp_path: Path) -> Rig:
+    return Rig(tmp_path)
+
+
+@pytest.fixture
+def make_rig(emulated: None, tmp_path: Path) -> Any:
+    return lambda **options: Rig(tmp_path, **options)
+
+
+@pytest.fixture
+def make_drive(tmp_path: Path) -> Any:
+    def make(seconds: float, scan_hz: int = 10, lasers: tuple[Any, ...] = (PRIMARY_SCAN,)) -> Path:
+        path = tmp_path / "drive.mcap"
+        Drive(seconds, scan_hz, lasers).write(path)
+        return path
+
+    return make
+
+
+@pytest.fixture
+def two_lasers() -> tuple[Any, Any]:
+    return PRIMARY_SCAN, AUXILIARY_SCAN
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    return f"hardware: {config.getoption('--hw-profile') or 'emulated'}; {os.cpu_count()} cores"
