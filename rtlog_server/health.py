@@ -58,7 +58,10 @@ def _device_status(device: DeviceReport) -> Any:
         **device.diagnostics,
     }
     serial = device.identity.get("serial_number", "")
-    return _status(LEVELS[device.state], device.name, device.message, serial, values)
+    level = LEVELS[device.state]
+    if device.state == OK and device.message != "connected":  # it delivers, and yet: a dirty window, a silent encoder
+        level = DiagnosticStatus.WARN
+    return _status(level, device.name, device.message, serial, values)
 
 
 def _server_status(report: Report, before: Report | None) -> Any:

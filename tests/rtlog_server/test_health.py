@@ -43,6 +43,12 @@ def test_diagnostics_level_each_device_and_the_ticks() -> None:
     assert {pair.key: pair.value for pair in server.values}["dropped_ticks"] == "7"
 
 
+def test_diagnostics_warn_of_a_device_that_delivers_and_is_not_well() -> None:
+    dirty = replace(DEVICES[0], message="front window is dirty")
+    told = diagnostics(replace(REPORT, devices=[dirty, DEVICES[1]]), None).status
+    assert (told[0].level, told[0].message) == (1, "front window is dirty")
+
+
 def test_diagnostics_warn_of_losses_once() -> None:
     worse = replace(REPORT, dropped_ticks=9)
     assert diagnostics(worse, REPORT).status[-1].level == 1
