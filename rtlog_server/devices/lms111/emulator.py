@@ -187,8 +187,8 @@ class Lms111Emulator:
     def _accept(self) -> None:
         assert self._listener is not None
         connection, _ = self._listener.accept()
-        if self._client is not None:
-            self._receive()  # it may have hung up
+        while self._client is not None and self._receive():
+            pass  # it may have hung up after its last words
         if self._client is not None:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_ON_CLOSE)
             connection.close()
@@ -200,13 +200,14 @@ class Lms111Emulator:
         self._receiver = Receiver(self._dialect)
         self._loop.watch(connection, self._receive)
 
-    def _receive(self) -> None:
+    def _receive(self) -> bool:
+        """Take and answer what the client sent; False: there was nothing."""
         if self._client is None:
-            return  # it went while an earlier event was handled
+            return False  # it went while an earlier event was handled
         try:
             data = self._client.recv(65536)
         except BlockingIOError:
-            return
+            return False
         except OSError:
             data = b""
         if not data:
@@ -214,6 +215,7 @@ class Lms111Emulator:
         elif not self._silent:
             for payload in self._receiver.feed(data):
                 self._send(self._answer(payload))
+        return True
 
     def _answer(self, payload: bytes) -> bytes:
         try:
