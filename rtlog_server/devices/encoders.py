@@ -10,6 +10,9 @@ possible movement, the total is *doubtful*: the least movement is taken, and the
 
     counts in the turn    4000 |  64      total = 4096 * turns + counts in the turn
     total                 4000 | 4160     96 onward, not 3936 back
+
+Encoders that are asked one after the other are latched at different moments, and a reading has one stamp: each position
+is brought to it by the speed since the encoder's last reading. The counts stay as they were told.
 """
 
 import math
@@ -41,9 +44,7 @@ class EncoderReading:
     complete_ns: int  # monotonic; when the last answer was in
     names: tuple[str, ...]  # as in the profile
     counts: tuple[int, ...]  # as the encoder counts: wheels over many turns, steering within its turn
-    positions_rad: tuple[
-        float, ...
-    ]  # wheels over many turns, steering -π … π about straight ahead; ahead, left positive
+    positions_rad: tuple[float, ...]  # at measured_ns; wheels over many turns, steering -π … π; ahead, left positive
     doubtful: tuple[str, ...]  # wheels that may have turned more often since their last reading than `counts` says
 
 
@@ -85,6 +86,7 @@ class TurnCounter:
         self._counts_per_m = counts_per_turn / (2 * math.pi * wheel_radius_m)
         self._last: tuple[int, int] | None = None  # total, latched_ns
         self._rate: float | None = None  # counts/s
+        self._lost = 0  # what an encoder that counts turns forgot when it lost its power
 
     def count(self, raw: int, latched_ns: int) -> tuple[int, bool]:
         """The total at a reading, and whether it is doubtful; the first reading is its own total."""
@@ -92,21 +94,37 @@ class TurnCounter:
             self._last = raw, latched_ns
             return raw, False
         last, last_ns = self._last
+        total, ambiguous, possible = self._fit(raw, latched_ns)
+        doubtful = ambiguous or not possible
+        if doubtful:
+            total = nearest_total(raw, self._counts_per_turn, last)
+            self._lost = (total - raw) % self._modulus
+        elapsed_s = (latched_ns - last_ns) * 1e-9
+        known = 0 < latched_ns - last_ns <= MAX_SPEED_AGE_NS
+        self._rate = (total - last) / elapsed_s if known else None
+        self._last = total, latched_ns
+        return total, doubtful
+
+    def is_possible(self, raw: int, latched_ns: int) -> bool:
+        """Whether a wheel can have moved there since the last reading; always, if that is long ago."""
+        if self._last is None:
+            return True
+        _, ambiguous, possible = self._fit(raw, latched_ns)
+        return ambiguous or possible
+
+    def _fit(self, raw: int, latched_ns: int) -> tuple[int, bool, bool]:
+        """The total nearest to the prediction, whether another fits as well, and whether a wheel can get there."""
+        assert self._last is not None
+        last, last_ns = self._last
         elapsed_s = (latched_ns - last_ns) * 1e-9
         if self._rate is None:
             predicted, reach = last, self._counts_per_m * MAX_SPEED_M_S * elapsed_s
         else:
             predicted = last + round(self._rate * elapsed_s)
             reach = self._counts_per_m * MAX_ACCELERATION_M_S2 * elapsed_s**2 / 2
-        total = nearest_total(raw, self._modulus, predicted)
+        total = nearest_total(raw + self._lost, self._modulus, predicted)
         movable = reach + MARGIN_TURNS * self._counts_per_turn
-        doubtful = reach >= self._modulus / 2 or abs(total - predicted) > movable
-        if doubtful:
-            total = nearest_total(raw, self._counts_per_turn, last)
-        known = 0 < latched_ns - last_ns <= MAX_SPEED_AGE_NS
-        self._rate = (total - last) / elapsed_s if known else None
-        self._last = total, latched_ns
-        return total, doubtful
+        return total, reach >= self._modulus / 2, abs(total - predicted) <= movable
 
 
 class ReadingMaker:
@@ -121,6 +139,7 @@ class ReadingMaker:
         self._encoders = list(encoders)
         self._moduli: dict[str, int] = {}
         self._counters: dict[str, TurnCounter] = {}
+        self._before: dict[str, tuple[float, int]] = {}  # position_rad, latched_ns of the last reading
         for name, modulus in moduli.items():
             self.set_modulus(name, modulus)
 
@@ -129,28 +148,50 @@ class ReadingMaker:
         if self._moduli.get(name) == modulus:
             return
         self._moduli[name] = modulus
+        self._before.pop(name, None)
         encoder = next(encoder for encoder in self._encoders if encoder.name == name)
         if encoder.role != "steering" and encoder.wheel_radius_m is not None:
             self._counters[name] = TurnCounter(encoder.counts_per_turn, modulus, encoder.wheel_radius_m)
 
+    def is_possible(self, name: str, fix: Fix) -> bool:
+        """Whether the encoder can have moved there; if not, the fix is corrupted, or the wheel spins."""
+        counter = self._counters.get(name)
+        return counter is None or counter.is_possible(fix.raw, fix.latched_ns)
+
     def reading(self, fixes: Mapping[str, Fix]) -> EncoderReading:
         """The reading of at least one fix; encoders without one are left out."""
         answered = [encoder for encoder in self._encoders if encoder.name in fixes]
-        counts, doubtful = [], []
+        measured_ns = sum(fix.latched_ns for fix in fixes.values()) // len(fixes)
+        counts, positions_rad, doubtful = [], [], []
         for encoder in answered:
-            total, in_doubt = self._count(encoder, fixes[encoder.name])
+            fix = fixes[encoder.name]
+            total, in_doubt = self._count(encoder, fix)
             counts.append(total)
             if in_doubt:
                 doubtful.append(encoder.name)
+                self._before.pop(encoder.name, None)  # it tells no speed
+            positions_rad.append(self._position_at(encoder, position_rad(encoder, total), fix.latched_ns, measured_ns))
         return EncoderReading(
-            measured_ns=sum(fix.latched_ns for fix in fixes.values()) // len(fixes),
+            measured_ns=measured_ns,
             complete_ns=max(fix.complete_ns for fix in fixes.values()),
             names=tuple(encoder.name for encoder in answered),
             counts=tuple(counts),
-            positions_rad=tuple(position_rad(encoder, total) for encoder, total in zip(answered, counts, strict=True)),
+            positions_rad=tuple(positions_rad),
             doubtful=tuple(doubtful),
         )
 
     def _count(self, encoder: Encoder, fix: Fix) -> tuple[int, bool]:
         counter = self._counters.get(encoder.name)
         return counter.count(fix.raw, fix.latched_ns) if counter else (fix.raw % encoder.counts_per_turn, False)
+
+    def _position_at(self, encoder: Encoder, latched_rad: float, latched_ns: int, measured_ns: int) -> float:
+        """Where the encoder was at `measured_ns`, a few ms from its latch, by its speed since the last reading."""
+        before_rad, before_ns = self._before.get(encoder.name, (latched_rad, latched_ns))
+        self._before[encoder.name] = latched_rad, latched_ns
+        if not 0 < latched_ns - before_ns <= MAX_SPEED_AGE_NS:
+            return latched_rad
+        share = (measured_ns - latched_ns) / (latched_ns - before_ns)
+        if encoder.role != "steering":
+            return latched_rad + share * (latched_rad - before_rad)
+        moved_rad = math.remainder(latched_rad - before_rad, 2 * math.pi)
+        return math.remainder(latched_rad + share * moved_rad, 2 * math.pi)

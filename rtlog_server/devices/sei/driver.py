@@ -4,12 +4,15 @@ In: the bus and its encoders from the profile. Out: an `EncoderReading` a tick.
 
     start        asked, one after the other      done   tick
       |--- left ---|--- right ---|                 |      |
-           ^            ^                          |<4 ms>|
-        latched      latched       measured_ns is their mean
+           ^            ^                          `round_timing`
+        latched      latched       measured_ns is their mean, to which `ReadingMaker` brings the positions
 
 When a position was latched: an encoder answers at once with its latest look at the disc, and it looks each 4 ms; so on
 the average 2 ms before the request had reached it. The request leaves when it is written; replies may be held up by a
-USB adapter, so their arrival says less.
+USB adapter, so their arrival says less. In strobe mode all of them are latched when the strobe has reached them.
+
+The bus takes one question at a time, and no encoder hears the next while another answers: at 9600 baud a round of two
+takes 6.3 ms single-turn and 10.4 ms multi-turn, at 115200 a twelfth of that, and the host's delays on top.
 """
 
 import time
@@ -22,19 +25,20 @@ from rtlog_server.devices.encoders import EncoderReading, Fix, ReadingMaker
 from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.identity import identify_encoder
 from rtlog_server.devices.sei.port import SeiPort
+from rtlog_server.devices.sei.round_timing import RoundTiming
 
-MARGIN_NS = 4_000_000  # from the last reply to the tick
 TURNAROUND_NS = 500_000  # first guess of what a reply takes beyond the wire
-SMOOTHING = 8  # rounds over which the length of a round is averaged
-SILENT_ROUNDS = 5  # without any answer, then the port is opened anew
-BAUD_RECOVERY_ASKS = 10  # an encoder that lost its power is at 9600 baud again
+EMPTY_ROUNDS = 5  # without any position, then the port is opened anew
+BAUD_RECOVERY_ASKS = 5  # an encoder that lost its power is at 9600 baud again
+AGREEMENT_TURNS = 0.1  # two answers in one round that differ by less are no noise
+EVENTS = ("retries", "timeouts", "garbled", "impossible", "doubtful turns")
 
 
 class SeiEncoders(Device[EncoderReading]):
     """All US Digital A2 encoders of the bus.
 
-    An encoder that does not answer is asked once more; then it is left out of the readings, named in `message`, and
-    asked after each reading until it is back.
+    An encoder that does not answer, or from where its wheel cannot be, is asked once more. One that is silent is then
+    left out of the readings, named in `message`, and asked after each reading until it is back.
     """
 
     def __init__(self, name: str, bus: SeiBus, encoders: Sequence[Encoder]) -> None:
@@ -50,11 +54,13 @@ class SeiEncoders(Device[EncoderReading]):
         turns = protocol.TURNS if self._multi_turn else 1
         self._maker = ReadingMaker(encoders, {e.name: e.counts_per_turn * turns for e in encoders})
         self._silent: dict[str, int] = {}  # encoder → how often it was asked in vain
-        self._silent_rounds = 0
-        self._round_ns = len(self._encoders) * (protocol.wire_ns(1 + self._reply_bytes, bus.baud) + TURNAROUND_NS)
+        self._empty_rounds = 0
+        wire_ns = protocol.wire_ns(1 + self._reply_bytes, bus.baud)
+        self._timing = RoundTiming(len(self._encoders) * (wire_ns + TURNAROUND_NS))
         self._tick_ns = 0
+        self._measured_before_ns: int | None = None
         self._tally: Counter[str] = Counter()
-        self._last_garbled = "none"
+        self._last_garbled = self._last_doubtful = "none"
 
     def start(self, grid: TickGrid) -> None:
         self._stale_after_ns = max(self._stale_after_ns, 3 * grid.period_ns)
@@ -63,12 +69,12 @@ class SeiEncoders(Device[EncoderReading]):
     def connect(self) -> None:
         self._port = SeiPort(self._bus)
         self._port.settle(self._encoders)
-        self._silent, self._silent_rounds = {}, 0
+        self._silent, self._empty_rounds = {}, 0
         self.identity = {encoder.name: str(identify_encoder(self._port, encoder)) for encoder in self._encoders}
 
     def read(self) -> None:
         assert self.grid is not None  # set by start()
-        lead_ns = self._round_ns + MARGIN_NS
+        lead_ns = self._timing.lead_ns
         now_ns = time.monotonic_ns()
         tick_ns = self.grid.next_after(max(now_ns + lead_ns, self._tick_ns))
         wait_s = (tick_ns - lead_ns - now_ns) * 1e-9
@@ -76,39 +82,38 @@ class SeiEncoders(Device[EncoderReading]):
             return
         self._tick_ns = tick_ns
         assert self._port is not None  # connect() opened it
-        self._poll_round(self._port)
+        self._poll_round(self._port, tick_ns - lead_ns)
 
     def disconnect(self) -> None:
         if self._port is not None:
             self._port.close()
             self._port = None
 
-    def _poll_round(self, port: SeiPort) -> None:
-        started_ns = time.monotonic_ns()
+    def _poll_round(self, port: SeiPort, planned_ns: int) -> None:
+        strobed_ns = port.strobe() if self._bus.strobe else None
         asked = [name for name in self._addresses if name not in self._silent]
-        fixes = self._ask_all(port, asked)
-        missed = [name for name in asked if name not in fixes]
-        if asked and not missed:
-            self._round_ns += (time.monotonic_ns() - started_ns - self._round_ns) // SMOOTHING
-        self._tally["retries"] += len(missed)
-        fixes |= self._ask_all(port, missed)
-        if fixes:
-            reading = self._maker.reading(fixes)
-            self._tally["doubtful turns"] += len(reading.doubtful)
-            self.hand_over(reading)
-        self._silent |= {name: 0 for name in missed if name not in fixes}
-        self._seek_silent(port)
+        fixes = {name: self._ask(port, name, strobed_ns) for name in asked}
+        again = [name for name, fix in fixes.items() if fix is None or not self._maker.is_possible(name, fix)]
+        if asked and not again:
+            self._timing.add(planned_ns, time.monotonic_ns())
+        self._tally["retries"] += len(again)
+        for name in again:
+            first, fixes[name] = fixes[name], self._ask(port, name, strobed_ns)
+            if first is None and fixes[name] is None:
+                self._silent[name] = 0
+            elif not self._is_credible(name, first, fixes[name]):
+                self._tally["impossible"] += 1
+                fixes[name] = None
+        found = {name: fix for name, fix in fixes.items() if fix is not None}
+        if found:
+            self._hand_over(found)
+        heard = self._seek_silent(port) or bool(found)
         self._tell_health(port)
-        self._silent_rounds = 0 if len(self._silent) < len(self._addresses) else self._silent_rounds + 1
-        if self._silent_rounds >= SILENT_ROUNDS:
+        self._empty_rounds = 0 if heard else self._empty_rounds + 1
+        if self._empty_rounds >= EMPTY_ROUNDS:
             raise DeviceError(f"{self._bus.port}: no encoder answers")
 
-    def _ask_all(self, port: SeiPort, names: Sequence[str]) -> dict[str, Fix]:
-        """The positions of those that answered."""
-        fixes = {name: self._ask(port, name) for name in names}
-        return {name: fix for name, fix in fixes.items() if fix is not None}
-
-    def _ask(self, port: SeiPort, name: str) -> Fix | None:
+    def _ask(self, port: SeiPort, name: str, strobed_ns: int | None = None) -> Fix | None:
         request = protocol.position_request(self._addresses[name])
         try:
             exchange = port.exchange(request, self._reply_bytes)
@@ -120,27 +125,48 @@ class SeiEncoders(Device[EncoderReading]):
             self._tally["garbled"] += 1
             self._last_garbled = f"{name}: {error}"
             return None
-        arrived_ns = exchange.sent_ns + protocol.wire_ns(len(request), self._bus.baud)
-        return Fix(raw, arrived_ns - protocol.SNAPSHOT_NS // 2, exchange.complete_ns)
+        wire_ns = protocol.wire_ns(len(request), self._bus.baud)
+        if strobed_ns is not None:
+            return Fix(raw, strobed_ns + wire_ns, exchange.complete_ns)
+        return Fix(raw, exchange.sent_ns + wire_ns - protocol.SNAPSHOT_NS // 2, exchange.complete_ns)
 
-    def _seek_silent(self, port: SeiPort) -> None:
-        """Ask one of the silent ones a round, the reading being handed over, so that it costs the others nothing."""
+    def _is_credible(self, name: str, first: Fix | None, second: Fix | None) -> bool:
+        """Whether a second answer is possible, or like the first: then the wheel did jump."""
+        if second is None or self._maker.is_possible(name, second):
+            return second is not None
+        counts_per_turn = self._counts_per_turn[name]
+        apart = (second.raw - first.raw) % counts_per_turn if first is not None else counts_per_turn // 2
+        return min(apart, counts_per_turn - apart) <= AGREEMENT_TURNS * counts_per_turn
+
+    def _hand_over(self, fixes: dict[str, Fix]) -> None:
+        reading = self._maker.reading(fixes)
+        if reading.doubtful:
+            self._tally["doubtful turns"] += len(reading.doubtful)
+            gap_s = (reading.measured_ns - (self._measured_before_ns or reading.measured_ns)) * 1e-9
+            self._last_doubtful = f"{', '.join(reading.doubtful)}, {gap_s:.1f} s after the reading before"
+        self._measured_before_ns = reading.measured_ns
+        self.hand_over(reading)
+
+    def _seek_silent(self, port: SeiPort) -> bool:
+        """Ask one of the silent ones, once the reading is handed over: that costs the others nothing. Is it back?"""
         if not self._silent:
-            return
+            return False
         name, asked = next(iter(self._silent.items()))
         del self._silent[name]
         if self._ask(port, name) is not None:
-            return
+            return True
         self._silent[name] = asked + 1  # at the end of the queue
-        if self._bus.baud != protocol.POWER_UP_BAUD and (asked + 1) % BAUD_RECOVERY_ASKS == 0:
-            port.raise_baud()
+        if (asked + 1) % BAUD_RECOVERY_ASKS == 0:
+            port.recover_baud()
+        return False
 
     def _tell_health(self, port: SeiPort) -> None:
         self.message = f"no answer from {', '.join(sorted(self._silent))}" if self._silent else "connected"
         self.diagnostics = {
             **{name: "silent" if name in self._silent else "ok" for name in self._addresses},
-            **{event: str(self._tally[event]) for event in ("retries", "timeouts", "garbled", "doubtful turns")},
+            **{event: str(self._tally[event]) for event in EVENTS},
             "last garbled": self._last_garbled,
-            "round_ms": f"{self._round_ns * 1e-6:.1f}",
+            "last doubtful": self._last_doubtful,
+            "lead_ms": f"{self._timing.lead_ns * 1e-6:.1f}",
             "echo": "yes" if port.echo else "no",
         }

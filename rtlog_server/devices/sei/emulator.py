@@ -6,20 +6,19 @@ In: the true position of every encoder as a function of time. Out: replies at th
     encoder                            looked ^ each 4 ms, the latest look is the answer
     reply, echo                                     |  hi  |  lo  |
 
-As on the real bus: an encoder looks at its disc each 4 ms; it starts at 9600 baud after power-up, and a host that sends
-at another rate, or something that it does not understand, gets no answer.
+As on the real bus: an encoder looks at its disc each 4 ms, or in strobe mode when it is told to; it starts at 9600 baud
+after power-up, and a host that sends at another rate, or something that it does not understand, gets no answer.
 """
 
-import contextlib
 import os
 import select
 import termios
 import threading
 import time
-import tty
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from rtlog_server.devices.pty_link import PtyLink
 from rtlog_server.devices.sei import protocol
 
 BAUD_OF = {termios.B9600: 9600, termios.B115200: 115200}
@@ -36,6 +35,7 @@ class SeiBusEmulator:
         position: (address, monotonic ns) → counts over many turns; called in the emulator's thread.
         echo: the adapter returns what it is sent.
         multi_turn: the encoders' mode.
+        strobe: the encoders' mode: they latch at a strobe.
 
     Raises:
         OSError: the link cannot be made.
@@ -48,15 +48,18 @@ class SeiBusEmulator:
         position: Callable[[int, int], int],
         echo: bool = False,
         multi_turn: bool = False,
+        strobe: bool = False,
     ) -> None:
-        self._link = link
         self._encoders = dict(encoders)
         self._position = position
         self._echo = echo
         self._multi_turn = multi_turn
+        self._strobed_ns: int | None = 0 if strobe else None
         self._baud = dict.fromkeys(self._encoders, protocol.POWER_UP_BAUD)
         self._muted: set[int] = set()
         self._garbled_replies = 0
+        self._wrong_replies = 0
+        self._pty = PtyLink(link)
         self._thread: threading.Thread | None = None
         self._unplugged = threading.Event()
         self.replug()
@@ -84,6 +87,14 @@ class SeiBusEmulator:
         """The next replies are corrupted on the wire."""
         self._garbled_replies = replies
 
+    def bend(self, replies: int) -> None:
+        """The next positions are wrong by a third of a turn, and nothing else shows it."""
+        self._wrong_replies = replies
+
+    def babble(self, data: bytes) -> None:
+        """Noise on the bus."""
+        self._pty.write(data)
+
     def unplug(self) -> None:
         """The USB adapter is pulled: the terminal hangs up, its name is gone."""
         if self._thread is None:
@@ -91,44 +102,26 @@ class SeiBusEmulator:
         self._unplugged.set()
         self._thread.join()
         self._thread = None
-        if self._link.is_symlink() and str(self._link.readlink()) == self._terminal:
-            self._link.unlink()
-        os.close(self._slave)
-        os.close(self._master)
+        self._pty.unplug()
 
     def replug(self) -> None:
         """The adapter is back under the same link."""
-        if self._link.exists() and not self._link.is_symlink():
-            raise FileExistsError(f"{self._link} is in the way and no symbolic link")
-        self._master, self._slave = os.openpty()  # the slave end stays open: without any, the master reads EIO
-        tty.setraw(self._slave)
-        self._set_baud_of_power_up()
-        self._terminal = os.ttyname(self._slave)
-        beside = self._link.with_name(f".{self._link.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(self._terminal)
-        beside.replace(self._link)
+        self._pty.plug()
         self._unplugged.clear()
-        self._thread = threading.Thread(target=self._serve, name=f"SEI emulator {self._link}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="SEI emulator", daemon=True)
         self._thread.start()
 
     # The thread
 
-    def _set_baud_of_power_up(self) -> None:
-        attributes = termios.tcgetattr(self._slave)
-        attributes[4] = attributes[5] = termios.B9600
-        termios.tcsetattr(self._slave, termios.TCSANOW, attributes)
-
     def _serve(self) -> None:
         received = bytearray()
         while not self._unplugged.is_set():
-            if not select.select([self._master], [], [], WATCH_S)[0]:
+            if not select.select([self._pty.master], [], [], WATCH_S)[0]:
                 received.clear()  # a command broken off
                 continue
-            sent = os.read(self._master, 256)
+            sent = os.read(self._pty.master, 256)
             arriving_ns = time.monotonic_ns()
-            # A pseudo-terminal has no baud rate of its own, but it remembers the one that the host has set.
-            host_baud = BAUD_OF.get(termios.tcgetattr(self._master)[5], 0)
+            host_baud = BAUD_OF.get(self._pty.host_speed(), 0)
             if not host_baud:
                 continue
             received += sent
@@ -148,13 +141,18 @@ class SeiBusEmulator:
         """The reply; empty to what the encoder does not know."""
         match request:
             case protocol.Request(extended=False, command=protocol.POSITION):
-                looked_ns = at_ns - at_ns % protocol.SNAPSHOT_NS
+                looked_ns = at_ns - at_ns % protocol.SNAPSHOT_NS if self._strobed_ns is None else self._strobed_ns
                 counts = self._position(address, looked_ns)
+                if self._wrong_replies > 0:
+                    self._wrong_replies -= 1
+                    counts += self._encoders[address] // 3
                 reply = protocol.encode_position(counts, self._encoders[address], self._multi_turn)
                 if self._garbled_replies > 0:
                     self._garbled_replies -= 1
                     return reply[:-2] + b"\xff"  # a byte lost, the other with its bits stuck
                 return reply
+            case protocol.Request(extended=False, command=protocol.STROBE) if self._strobed_ns is not None:
+                self._strobed_ns = at_ns
             case protocol.Request(extended=True, command=protocol.READ_SERIAL_NUMBER):
                 return protocol.encode_serial_number(FIRST_SERIAL_NUMBER + address)
             case protocol.Request(extended=True, command=protocol.SET_BAUD, data=data):
@@ -170,5 +168,4 @@ class SeiBusEmulator:
     def _write_at(self, data: bytes, at_ns: int) -> None:
         while (wait_ns := at_ns - time.monotonic_ns()) > 0:
             time.sleep(wait_ns * 1e-9)
-        with contextlib.suppress(BlockingIOError):  # nobody reads: a wire does not wait
-            os.write(self._master, data)
+        self._pty.write(data)

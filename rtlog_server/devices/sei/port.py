@@ -5,18 +5,15 @@ vanish comes out as one DeviceError.
 """
 
 import contextlib
-import errno
-import os
-import termios
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import serial
-
 from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.device import DeviceError
 from rtlog_server.devices.sei import protocol
+from rtlog_server.devices.sei.protocol import SeiError
+from rtlog_server.devices.serial_port import LOST, open_serial_port
 
 TIMEOUT_S = 0.03  # for one reply; field drivers use 10 … 30 ms
 BAUD_CHANGE_S = 0.02  # its reply, of unpublished length, is waited out
@@ -36,20 +33,7 @@ class SeiPort:
     def __init__(self, bus: SeiBus) -> None:
         self._bus = bus
         self._echo = bus.echo == "yes"
-        try:
-            # exclusive: two readers of one port steal each other's bytes
-            self._serial = serial.Serial(
-                bus.port, protocol.POWER_UP_BAUD, timeout=TIMEOUT_S, write_timeout=1.0, exclusive=True
-            )
-        except OSError as error:
-            taken = error.errno in (errno.EAGAIN, errno.EBUSY)
-            reason = "another process has it" if taken else os.strerror(error.errno or errno.EIO)
-            raise DeviceError(f"{bus.port}: cannot open the port: {reason}") from error
-        except termios.error as error:
-            raise DeviceError(f"{bus.port}: is no serial port: {error.args[-1]}") from error
-        # USB adapters collect bytes for 16 ms unless told otherwise; other ports have no such switch.
-        with contextlib.suppress(ValueError):
-            self._serial.set_low_latency_mode(True)
+        self._serial = open_serial_port(bus.port, protocol.POWER_UP_BAUD, TIMEOUT_S)
 
     @property
     def echo(self) -> bool:
@@ -57,14 +41,25 @@ class SeiPort:
         return self._echo
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(*LOST):
             self._serial.close()
 
     def exchange(self, request: bytes, reply_bytes: int) -> Exchange:
-        """Ask and wait for the whole reply or the time-out. Raises: SeiError, the echo is another than was sent."""
+        """Ask and wait for the whole reply or the time-out.
+
+        Raises: SeiError: the echo is another than was sent, or more came than an encoder sends.
+        """
         sent_ns, received = self._send_and_read(request, reply_bytes + len(request) * self._echo)
         complete_ns = time.monotonic_ns()
+        with self._guard():
+            excess = self._serial.in_waiting
+        if excess:
+            raise SeiError(f"{excess} bytes more than the reply")
         return Exchange(protocol.strip_echo(received, request, self._echo), sent_ns, complete_ns)
+
+    def strobe(self) -> int:
+        """Let all encoders that are in strobe mode latch at once; when the request was given to the port."""
+        return self._send_and_read(protocol.strobe_request(), int(self._echo))[0]
 
     def settle(self, encoders: Sequence[Encoder]) -> None:
         """Bring the encoders to the profile's baud rate and find out whether the adapter echoes.
@@ -73,14 +68,14 @@ class SeiPort:
             DeviceError: no encoder answers, or otherwise than the profile says.
         """
         if self._bus.baud != protocol.POWER_UP_BAUD:
-            self.raise_baud()
+            self.recover_baud()
         try:
             # A profile with a bus was checked to hold every address.
             reply_bytes = protocol.position_reply_bytes(self._bus.turns == "multi")
             self.learn_echo([encoder.address or 0 for encoder in encoders], reply_bytes)
         except DeviceError:
             if self._bus.baud == protocol.POWER_UP_BAUD:
-                self.reset_fast_encoders()
+                self.recover_baud()
             raise
         if self._bus.echo != "auto" and self._echo != (self._bus.echo == "yes"):
             raise DeviceError(f"{self._bus.port}: encoder_bus.echo is {self._bus.echo!r}, but the adapter differs")
@@ -110,21 +105,19 @@ class SeiPort:
             )
         raise DeviceError(f"{self._bus.port}: no encoder answers")
 
-    def raise_baud(self) -> None:
-        """Bring every encoder from 9600 to 115200 baud; those that are there already see noise and ignore it."""
-        with self._guard():
-            self._serial.baudrate = protocol.POWER_UP_BAUD
-        self._send_and_drain(protocol.fast_baud_request())
-        with self._guard():
-            self._serial.baudrate = self._bus.baud
+    def recover_baud(self) -> None:
+        """Bring encoders that are at the other rate to the profile's; those at the profile's see noise and ignore it.
 
-    def reset_fast_encoders(self) -> None:
-        """Bring encoders that another program left at 115200 baud back to 9600."""
+        An encoder that lost its power is back at 9600 baud; another program may have left one at 115200.
+        """
+        slow = self._bus.baud == protocol.POWER_UP_BAUD
         with self._guard():
-            self._serial.baudrate = protocol.BAUD_CODES[0]
-        self._send_and_drain(protocol.reset_request())
-        with self._guard():
+            self._serial.baudrate = protocol.BAUD_CODES[0] if slow else protocol.POWER_UP_BAUD
+            self._serial.write(protocol.reset_request() if slow else protocol.fast_baud_request())
+            self._serial.flush()
+            time.sleep(BAUD_CHANGE_S)
             self._serial.baudrate = self._bus.baud
+            self._serial.reset_input_buffer()
 
     def _send_and_read(self, request: bytes, length: int) -> tuple[int, bytes]:
         with self._guard():
@@ -134,16 +127,9 @@ class SeiPort:
             self._serial.write(request)
             return sent_ns, self._serial.read(length)
 
-    def _send_and_drain(self, request: bytes) -> None:
-        with self._guard():
-            self._serial.write(request)
-            self._serial.flush()
-            time.sleep(BAUD_CHANGE_S)
-            self._serial.reset_input_buffer()
-
     @contextlib.contextmanager
     def _guard(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, termios.error) as error:
+        except LOST as error:
             raise DeviceError(f"{self._bus.port}: lost the port: {error}") from error

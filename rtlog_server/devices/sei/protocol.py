@@ -6,10 +6,11 @@ encoder answers at once; an encoder that does not understand is silent. Numbers 
     host     1n                                    position request to address n (0 … E, F = all)
     encoder        hi lo                           single-turn mode: 0 … counts per turn - 1
     encoder        hi lo hi lo                     multi-turn mode: turns modulo 65536, then the same
+    host     4F                                    strobe: in strobe mode all encoders latch now, for the next request
     adapter  1n                                    some return every byte that is sent: the *echo*
 
-Source: US Digital, "SEI Absolute Encoder Communications Protocol". The strobe (`4F`) is left out: the opcode that puts
-an encoder into strobe mode is not public.
+Source: US Digital, "SEI Absolute Encoder Communications Protocol". The opcode that puts an encoder into strobe mode is
+not public, nor is the one that reads its mode: it is done once with US Digital's own software, and the profile says so.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ BITS_PER_BYTE = 10  # 8N1
 SNAPSHOT_NS = 4_000_000  # the encoder looks at its disc each 4 ms and answers with the latest look
 TURNS = 1 << 16  # the turn count of multi-turn mode starts again here
 
-POSITION = 0x1  # a command of one byte: command nibble, address nibble
+POSITION, STROBE = 0x1, 0x4  # a command of one byte: command nibble, address nibble
 EXTENDED = 0xF  # a command of several: this nibble, address nibble, then one of
 READ_SERIAL_NUMBER, RESET, SET_BAUD = 0x03, 0x0E, 0x0F
 BAUD_CODES = {0x00: 115200}
@@ -43,6 +44,11 @@ def wire_ns(length: int, baud: int) -> int:
 
 def position_request(address: int) -> bytes:
     return bytes([POSITION << 4 | address])
+
+
+def strobe_request(address: int = BROADCAST) -> bytes:
+    """Encoders in strobe mode take a reading now; nobody replies."""
+    return bytes([STROBE << 4 | address])
 
 
 def serial_number_request(address: int) -> bytes:

@@ -137,7 +137,7 @@ def test_a_flood_is_read_slowly_and_the_reader_is_still_heard(
     reader.wait_until_reading()
     with connect_to_stream(reader) as sly:
         sly.settimeout(0.05)
-        end_s = time.monotonic() + 1.0
+        end_s = time.monotonic() + 0.5
         taken = 0
         while time.monotonic() < end_s:
             try:

@@ -121,7 +121,7 @@ def test_a_clock_of_1970_is_set_and_then_tells_when_a_tag_was_read(
     reader.wait_until_reading(stream="polling")
     assert reader.device.diagnostics["clock"] == "right"
     errors_ns = []
-    for number in range(30):
+    for number in range(16):
         time.sleep(0.013 * (number % 8))  # at any time between two polls
         read_ns = time.monotonic_ns()
         emulator.read_tag(epcs[0])
@@ -131,7 +131,7 @@ def test_a_clock_of_1970_is_set_and_then_tells_when_a_tag_was_read(
     late_ns = [sample.complete_ns - sample.measured_ns for sample in reader.samples]
     assert all(late >= 0 for late in late_ns)
     assert max(late_ns) > 30_000_000  # what the stamps of reception would have been wrong by
-    assert sorted(errors_ns[10:])[10] < 30_000_000
+    assert sorted(errors_ns[8:])[4] < 30_000_000
 
 
 def test_a_clock_of_1970_that_cannot_be_set_is_told_and_not_believed(
