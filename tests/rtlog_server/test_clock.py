@@ -103,6 +103,16 @@ def test_a_host_that_stood_still_does_not_look_like_a_restart() -> None:
     assert np.percentile(error_ns, 99) < 1 * MS
 
 
+@pytest.mark.parametrize("wrong_us", [5_000_000, -5_000_000, 200_000, -200_000, 2**31, 9_999_999])
+def test_a_garbled_count_spoils_no_other(wrong_us: int) -> None:
+    device_us, receive_ns, true_ns = deliveries(np.random.default_rng(8), 3000)
+    device_us[1500] = (device_us[1500] + wrong_us) % WRAP_US
+    error_ns = np.abs(follow(DeviceClock(), device_us, receive_ns) - true_ns)
+    error_ns[1500] = 0  # which had no true one to tell
+    assert np.percentile(error_ns, 99) < 1 * MS
+    assert error_ns[1550:].max() < 1 * MS
+
+
 def test_the_line_lies_under_all_points_and_is_the_nearest() -> None:
     rng = np.random.default_rng(7)
     time_s = np.sort(rng.uniform(0, 60, 40))
