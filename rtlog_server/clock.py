@@ -27,7 +27,6 @@ WINDOW_S = 60.0
 SLOPE_AFTER_S = 10.0  # jitter over a shorter span would be taken for drift
 MAX_DRIFT_NS_PER_S = 300_000.0  # 300 ppm; two quartz clocks differ by less
 MAX_DISAGREEMENT_US = 10_000_000  # a device whose clock went on so differently from ours was restarted
-MAX_EARLY_NS = 100_000_000  # no delivery is faster than the fastest by so much: that count, or the last, was garbled
 
 Point = tuple[float, float]  # device time in s, receive minus device time in ns; both since the first count
 
@@ -60,9 +59,6 @@ class DeviceClock:
         since_first_us = self._device_us - self._first_us
         time_s = since_first_us * 1e-6
         delay_ns = receive_ns - self._first_ns - 1000 * since_first_us
-        if delay_ns < self._slope * time_s + self._intercept - MAX_EARLY_NS:
-            self._start(device_us, receive_ns)
-            since_first_us, time_s, delay_ns = 0, 0.0, 0
         self._add(time_s, delay_ns)
         line_ns = self._slope * time_s + self._intercept
         if delay_ns < line_ns:
