@@ -95,7 +95,7 @@ class Cia406Encoders(Device[EncoderReading]):
             port.send(pre_operational)
             settings = configure(objects, node.address, node.encoder, self._bus)
         except NodeSilentError as error:
-            node.problem = f"no answer ({error})"
+            node.problem = str(error)
             port.send(pre_operational)  # one that was stopped answers after this
         except CanOpenError as error:
             node.problem = str(error)
@@ -141,12 +141,14 @@ class Cia406Encoders(Device[EncoderReading]):
     def _tell_health(self) -> None:
         nodes, port = self._nodes, self._opened()
         told = [nodes.problems(), *(f"{node.name}: {node.health}" for node in nodes if node.emergency is not None)]
+        if nodes.rounds is not None and nodes.rounds.answered_twice:
+            told.append(f"{', '.join(sorted(nodes.rounds.answered_twice))}: two nodes answer to its id")
+            nodes.rounds.answered_twice.clear()
         self.message = "; ".join(filter(None, told)) or "connected"
         self.diagnostics = {
             **{node.name: node.health for node in nodes},
             **{event: str(nodes.tally[event]) for event in TALLIED},
             "last garbled": nodes.last_garbled,
-            "duplicates": str(nodes.rounds.duplicates if nodes.rounds is not None else 0),
             "noise": str(port.garbled),
             "controller": port.controller,
         }

@@ -37,7 +37,7 @@ class SyncRounds:
         self._latched_ns: int | None = None  # of the open round
         self._fixes: dict[str, Fix] = {}
         self._awaited: frozenset[str] = frozenset()
-        self.duplicates = 0  # second answers in a round: two nodes with one id
+        self.answered_twice: set[str] = set()  # in one round: two nodes have one id; whoever told it clears it
 
     @property
     def lead_ns(self) -> int:
@@ -66,9 +66,11 @@ class SyncRounds:
 
     def add(self, encoder: str, raw: int, arrived_ns: int) -> Mapping[str, Fix] | None:
         """A position; if none is missing any more, the round's."""
+        if encoder in self._fixes:
+            self.answered_twice.add(encoder)
+            return None
         if self._latched_ns is None:
             return None  # too late for its round
-        self.duplicates += encoder in self._fixes
         self._fixes[encoder] = Fix(raw, self._latched_ns, arrived_ns)
         if not self._awaited.issubset(self._fixes):
             return None
@@ -91,12 +93,11 @@ class TimerRounds:
         timer_ns: the period of the encoders' timers.
     """
 
-    duplicates = 0  # what comes twice cannot be told from what comes early
-
     def __init__(self, grid: TickGrid, position_wire_ns: int, timer_ns: int) -> None:
         self._grid = grid
         self._position_wire_ns = position_wire_ns
         self._stale_ns = STALE_TIMERS * timer_ns
+        self.answered_twice: set[str] = set()  # stays empty: what comes twice cannot be told from what comes early
         self._tick_ns = 0
         self._newest: dict[str, Fix] = {}
 

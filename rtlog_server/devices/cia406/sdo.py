@@ -64,7 +64,7 @@ class NodeObjects:
         except canopen.SdoAbortedError as error:
             raise ObjectRefusedError(f"object {name(address)}: {error}") from error
         except canopen.SdoCommunicationError as error:
-            raise NodeSilentError(f"object {name(address)}: {error}") from error
+            raise NodeSilentError(f"{error} (object {name(address)})") from error
 
 
 def name(address: Address) -> str:

@@ -74,12 +74,22 @@ def test_an_encoder_that_answers_first_makes_the_round_whole_again() -> None:
     assert set(rounds.add("left", 1, at_ns + 2 * MS) or {}) == {"left", "right"}
 
 
-def test_an_answer_that_comes_twice_is_counted() -> None:
+def test_an_answer_that_comes_twice_is_noticed_and_the_first_one_counts() -> None:
     rounds = sync_rounds()
-    rounds.sent(rounds.next_ns(0))
-    rounds.add("left", 1, 95 * MS)
-    rounds.add("left", 900, 95 * MS)
-    assert rounds.duplicates == 1
+    at_ns = rounds.next_ns(0)
+    rounds.sent(at_ns)
+    rounds.add("left", 1, at_ns + MS)
+    rounds.add("left", 900, at_ns + MS)
+    assert rounds.answered_twice == {"left"}
+    fixes = rounds.add("right", 2, at_ns + MS)
+    assert fixes is not None
+    assert fixes["left"].raw == 1
+    rounds.add("right", 900, at_ns + MS)  # after the round
+    assert rounds.answered_twice == {"left", "right"}
+    rounds.sent(rounds.next_ns(at_ns + 2 * MS))
+    rounds.answered_twice.clear()
+    rounds.add("left", 3, at_ns + 100 * MS)
+    assert not rounds.answered_twice
 
 
 def test_after_a_long_sleep_sync_keeps_to_the_grid() -> None:
