@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry import accumulate, compose, inverse, relative
-from processing.open_loop import mount_pose, odometry_at_scans, undistort
+from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
-from processing.scan_matching import match_scans, prepare_scan
+from processing.scan_matching import match_scans
+from processing.sweeps import sweeps_of
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def calibrate(run: Run) -> tuple[Run, WheelScale]:
 def estimate_scale(run: Run) -> WheelScale:
     """Compare what the wheels count over a few metres with what scan matches see of it."""
     odometry, mount = odometry_at_scans(run), mount_pose(run)
-    points = undistort(run.scans, odometry, mount)
+    sweeps = sweeps_of(run.scans, odometry, mount)
     driven = accumulate(np.zeros(3), odometry.deltas)
     way = np.append(0.0, np.cumsum(np.hypot(*odometry.deltas[:, :2].T)))
     counted, seen, variances = [], [], []
@@ -66,7 +67,7 @@ def estimate_scale(run: Run) -> WheelScale:
         guess = relative(driven[first], driven[last])
         if abs(guess[2]) > MAX_TURN_RAD or abs(guess[0]) < 0.5 * (way[last] - way[first]):
             continue
-        one, other = (prepare_scan(points[k], run.scans.angle_min, run.scans.angle_increment) for k in (first, last))
+        one, other = sweeps.scan(first), sweeps.scan(last)
         match = match_scans(one, other, compose(inverse(mount), compose(guess, mount)))
         motion, covariance = through_mount(mount, match.motion, match.covariance)
         if match.converged and match.inliers >= MIN_INLIERS and covariance[0, 0] < MAX_SIGMA_M**2:

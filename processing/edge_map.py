@@ -8,6 +8,7 @@ The piece grows along the drives: a stretch at a time is added, linked to what i
 guess for the next links is never worse than one stretch of open loop.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +48,7 @@ class Path:
 
     run_id: str
     keyframes: Ints  # (K,) their numbers in the run
-    scans: list[Scan]
+    scans: Sequence[Scan]  # K
     chain: Links  # K - 1 weak links, between (0, 1), (1, 2) …
     wheels: Links  # K - 1, odometry alone
     start: Array  # (3,) first guess of the first pose in the frame of the piece

@@ -112,7 +112,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     """Links between passes of one tag in parts of the map that no run joins: all else is joined without guessing."""
     scans: dict[int, Scan] = {}
     for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
-        scans |= {v: piece.scans[i] for v, i in zip(variables, indices, strict=True)}
+        scans |= {v: piece.scan(i) for v, i in zip(variables, indices, strict=True)}
     edges = [(variables[0], v) for variables in boundary.variables for v in variables]
     shape = (boundary.count, boundary.count)
     part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
@@ -150,7 +150,7 @@ def link_overlaps(
                     continue
                 i, last = int(near[k]), poses[q][k, :2]
                 guess = relative(poses[p][i], poses[q][k])
-                found = match_vehicles(solved[p].scans[i], solved[q].scans[k], guess, solved[q].input.mount, match)
+                found = match_vehicles(solved[p].scan(i), solved[q].scan(int(k)), guess, solved[q].input.mount, match)
                 if worth_a_link(found, LOOP_INLIERS):
                     ends.append((boundary.add(int(p), i), boundary.add(q, int(k))))
                     motions.append(found.motion)

@@ -5,26 +5,32 @@ that joins them: the weak links of Lu & Milios. Passes of tags are key frames, s
 
     scan   0 . . . . 5 . . . 9 . . .        every scan is matched to the key frame before it, not to the scan before it,
            ●         ●       ●              so errors add up per key frame; a new one is made when the view has changed
+
+A drive is estimated in segments, which begin and end with a key frame and know nothing of each other: they can be
+computed anywhere, and only one is in memory.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import OdometryNoise
-from processing.fusion import consistent, fuse
-from processing.geometry import accumulate, compose, compose_jacobians, inverse
+from processing.chain_step import carry, join, to_laser, to_vehicle, weigh
+from processing.geometry import accumulate, compose, inverse
 from processing.match_search import search_match
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
-from processing.read_log import Run, Scans
-from processing.scan_match import through_mount
-from processing.scan_matching import Matcher, Scan, match_scans, prepare_scan
+from processing.read_log import Run
+from processing.scan_matching import Matcher, Scan, match_scans
+from processing.sweeps import StoredScans, Sweeps, sweeps_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+SEGMENT_SCANS = 1500
 KEYFRAME_SPACING_M = 0.75
 KEYFRAME_TURN_RAD = 0.35
 MIN_INLIERS = 0.6  # fewer of the points that both must see: no match
@@ -42,14 +48,21 @@ class OpenLoop:
     """n scans, K key frames among them; poses of the vehicle, the first at (0, 0, 0)."""
 
     odometry: Motions  # n - 1, between scans
-    points: NDArray[np.float32]  # (n, B, 2) m, scanner frame, the motion during the sweep removed; NaN without a return
+    sweeps: Sweeps  # n
     keyframes: Ints  # (K,) scan indices, the first is 0
-    scans: list[Scan]  # K
     links: Links  # K - 1, between key frames in a row, fused: the chain
     wheels: Links  # K - 1, the same by odometry alone, with ample doubt: what is left where a match was wrong
     reference: Ints  # (n,) which key frame a scan was matched to
     offsets: Array  # (n, 3) pose of a scan in the frame of that key frame
     matched: NDArray[np.bool_]  # (n,) False: odometry alone
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+    @property
+    def scans(self) -> Sequence[Scan]:
+        """K, of the key frames."""
+        return StoredScans(self.sweeps, self.keyframes)
 
     @property
     def poses(self) -> Array:
@@ -88,37 +101,14 @@ def interpolate_poses(times: Array, poses: Array, at: Array) -> Array:
     return np.column_stack([np.interp(at, times, column) for column in columns])
 
 
-def undistort(scans: Scans, odometry: Motions, mount: Array) -> NDArray[np.float32]:
-    """Points (n, B, 2) of each sweep as if all beams had been measured at its first ray; NaN where there is no range.
-
-    While the mirror turns, the vehicle drives on: at 20 km/h and 15 ms a sweep that is 8 cm.
-    """
-    ranges = np.where(np.isfinite(scans.ranges), scans.ranges, np.nan).astype(np.float64)
-    angles = scans.angles
-    points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
-    if scans.time_increment_s != 0 and len(ranges) > 1:
-        seconds = np.diff(scans.times)
-        seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
-        rates = np.vstack([odometry.deltas, odometry.deltas[-1:]]) / np.append(seconds, seconds[-1])[:, None]
-        since = scans.time_increment_s * np.arange(len(angles))
-        if scans.time_increment_s < 0:
-            since = since - since[-1]
-        moved = rates[:, None, :] * since[None, :, None]  # (n, B, 3) of the vehicle, since the first ray
-        scanner = compose(inverse(mount), compose(moved, mount))
-        c, s = np.cos(scanner[..., 2]), np.sin(scanner[..., 2])
-        x, y = points[..., 0].copy(), points[..., 1].copy()
-        points[..., 0] = scanner[..., 0] + c * x - s * y
-        points[..., 1] = scanner[..., 1] + s * x + c * y
-    return points.astype(np.float32)
-
-
 class _Chain:
     """The growing chain of key frames, and where the vehicle is since the last of them."""
+
+    scan: Scan  # of the last key frame
 
     def __init__(self, count: int, mount: Array, match: Matcher) -> None:
         self.mount, self.to_scanner, self.match = mount, inverse(mount), match
         self.keyframes: list[int] = []
-        self.scans: list[Scan] = []
         self.motions: list[Array] = []
         self.covariances: list[Array] = []
         self.odometry_motions: list[Array] = []
@@ -136,38 +126,34 @@ class _Chain:
             self.odometry_motions.append(self.driven)
             self.odometry_covariances.append(GATE * self.driven_covariance)
         self.keyframes.append(k)
-        self.scans.append(scan)
+        self.scan = scan
         self.reference[k], self.offsets[k] = len(self.keyframes) - 1, 0.0
         self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))
         self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))
 
     def advance(self, k: int, scan: Scan, step: Array, noise: Array, search: bool) -> bool:
         """Match scan `k`, one odometry `step` after the last; False leaves all as it was."""
-        j_before, j_step = compose_jacobians(self.driven, step)
-        driven = compose(self.driven, step)
-        covariance = j_before @ self.driven_covariance @ j_before.T + j_step @ noise @ j_step.T
-        guess = compose(self.to_scanner, compose(compose(self.offset, step), self.mount))
+        driven, covariance = carry(self.driven, self.driven_covariance, step, noise)
+        guess = to_laser(self.mount, self.to_scanner, join(self.offset, step))
         if search:
-            result = search_match(self.scans[-1], scan, guess, SEARCH_M, SEARCH_RAD)
+            result = search_match(self.scan, scan, guess, SEARCH_M, SEARCH_RAD)
         else:
-            result = self.match(self.scans[-1], scan, guess)
-        motion, doubt = through_mount(self.mount, result.motion, result.covariance)
-        odometry = Motions(driven[None], covariance[None])
-        accepted = result.converged and result.inliers >= MIN_INLIERS
-        if not accepted or not consistent(Motions(driven[None], GATE * covariance[None]), motion[None], doubt[None])[0]:
+            result = self.match(self.scan, scan, guess)
+        if not (result.converged and result.inliers >= MIN_INLIERS):
             return False
-        fused = fuse(odometry, motion[None], doubt[None], np.array([True]))
-        doubt = GATE * covariance if search else fused.covariances[0]  # what had to be searched for may be elsewhere
-        self._arrive(k, fused.deltas[0], doubt, driven, covariance, result.overlap)
+        motion, doubt = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+        agrees, fused, fused_covariance = weigh(driven, covariance, GATE, motion, doubt)
+        if not agrees:
+            return False
+        if search:  # what had to be searched for may be elsewhere
+            fused_covariance = GATE * covariance
+        self._arrive(k, fused, fused_covariance, driven, covariance, result.overlap)
         return True
 
     def coast(self, k: int, step: Array, noise: Array) -> None:
         """Take odometry's word for scan `k`."""
-        j_before, j_step = compose_jacobians(self.offset, step)
-        covariance = j_before @ self.covariance @ j_before.T + j_step @ (GATE * noise) @ j_step.T
-        j_before, j_step = compose_jacobians(self.driven, step)
-        driven_covariance = j_before @ self.driven_covariance @ j_before.T + j_step @ noise @ j_step.T
-        self._arrive(k, compose(self.offset, step), covariance, compose(self.driven, step), driven_covariance, 0.0)
+        offset, covariance = carry(self.offset, self.covariance, step, GATE * noise)
+        self._arrive(k, offset, covariance, *carry(self.driven, self.driven_covariance, step, noise), 0.0)
 
     def _arrive(
         self, k: int, offset: Array, covariance: Array, driven: Array, driven_cov: Array, overlap: float
@@ -182,18 +168,54 @@ class _Chain:
         )
 
 
-def estimate_open_loop(run: Run, forced: Ints, match: Matcher = match_scans) -> OpenLoop:
-    """Drive through the run once. `forced`: scans that shall be key frames, ascending."""
-    odometry, mount = odometry_at_scans(run), mount_pose(run)
-    points = undistort(run.scans, odometry, mount)
-    count = len(points)
-    cuts = set(forced.tolist()) | {count - 1}
-    chain = _Chain(count, mount, match)
-    before = prepare_scan(points[0], run.scans.angle_min, run.scans.angle_increment)
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch of a run: s scans."""
+
+    first: int  # scan of the run
+    sweeps: Sweeps  # s
+    odometry: Motions  # s - 1
+    cuts: frozenset[int]  # scans of the segment that shall be key frames
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenSegment:
+    """The same, estimated; key frames and references are counted from the segment's first."""
+
+    first: int
+    keyframes: Ints  # (k,) the first and the last scan among them
+    motions: Array  # (k - 1, 3) between key frames in a row, fused
+    covariances: Array  # (k - 1, 3, 3)
+    wheels: Motions  # k - 1, by odometry alone
+    reference: Ints  # (s,)
+    offsets: Array  # (s, 3)
+    matched: NDArray[np.bool_]  # (s,)
+
+
+def cut_segments(sweeps: Sweeps, odometry: Motions, forced: Ints) -> list[Segment]:
+    """Neighbours share a scan. `forced`: scans that shall be key frames, ascending."""
+    last = len(sweeps) - 1
+    ends = [0, *range(SEGMENT_SCANS, last - SEGMENT_SCANS // 2, SEGMENT_SCANS), last]
+    return [
+        Segment(
+            a,
+            sweeps.cut(a, b),
+            Motions(odometry.deltas[a:b], odometry.covariances[a:b]),
+            frozenset(int(k) - a for k in (*forced, b) if a < k <= b),
+        )
+        for a, b in pairwise(ends)
+    ]
+
+
+def drive_segment(segment: Segment, match: Matcher) -> DrivenSegment:
+    """Drive through it once."""
+    sweeps, odometry = segment.sweeps, segment.odometry
+    chain = _Chain(len(sweeps), sweeps.mount, match)
+    scans = sweeps.scans(np.arange(len(sweeps)))
+    before = next(scans)
     chain.add_keyframe(0, before)
-    for k in range(1, count):
+    for k, current in enumerate(scans, start=1):
         step, noise = odometry.deltas[k - 1], odometry.covariances[k - 1]
-        current = prepare_scan(points[k], run.scans.angle_min, run.scans.angle_increment)
         if not chain.advance(k, current, step, noise, search=False):
             if chain.keyframes[-1] != k - 1:  # too little in common with the key frame; more with the scan before
                 chain.add_keyframe(k - 1, before)
@@ -202,24 +224,52 @@ def estimate_open_loop(run: Run, forced: Ints, match: Matcher = match_scans) -> 
                 or chain.advance(k, current, step, noise, search=True)
             ):
                 chain.coast(k, step, noise)
-        if chain.wants_keyframe or k in cuts:
+        if chain.wants_keyframe or k in segment.cuts:
             chain.add_keyframe(k, current)
         before = current
-    return OpenLoop(
-        odometry,
-        points,
+    return DrivenSegment(
+        segment.first,
         np.array(chain.keyframes, np.int64),
-        chain.scans,
-        _in_a_row(chain.motions, chain.covariances, robust=True),
-        _in_a_row(chain.odometry_motions, chain.odometry_covariances, robust=False),
+        np.array(chain.motions).reshape(-1, 3),
+        np.array(chain.covariances).reshape(-1, 3, 3),
+        Motions(
+            np.array(chain.odometry_motions).reshape(-1, 3), np.array(chain.odometry_covariances).reshape(-1, 3, 3)
+        ),
         chain.reference,
         chain.offsets,
         chain.matched,
     )
 
 
+def join_segments(sweeps: Sweeps, odometry: Motions, parts: Sequence[DrivenSegment]) -> OpenLoop:
+    """The whole run. A scan that two segments share is the last of the one and the first key frame of the other."""
+    counts = np.cumsum([0] + [len(part.keyframes) - 1 for part in parts])
+    keyframes, reference, offsets, matched = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [], []
+    for part, before in zip(parts, counts[:-1], strict=True):
+        keyframes.append(part.first + part.keyframes[1:])
+        reference.append(before + part.reference[1:])
+        offsets.append(part.offsets[1:])
+        matched.append(part.matched[1:])
+    return OpenLoop(
+        odometry,
+        sweeps,
+        np.concatenate(keyframes),
+        _in_a_row([part.motions for part in parts], [part.covariances for part in parts], robust=True),
+        _in_a_row([part.wheels.deltas for part in parts], [part.wheels.covariances for part in parts], robust=False),
+        np.concatenate(reference),
+        np.concatenate([np.zeros((1, 3)), *offsets]),
+        np.concatenate([np.zeros(1, bool), *matched]),
+    )
+
+
+def estimate_open_loop(run: Run, forced: Ints, match: Matcher = match_scans) -> OpenLoop:
+    """Drive through a run, segment by segment. `forced`: scans that shall be key frames, ascending."""
+    odometry = odometry_at_scans(run)
+    sweeps = sweeps_of(run.scans, odometry, mount_pose(run))
+    return join_segments(sweeps, odometry, [drive_segment(of, match) for of in cut_segments(sweeps, odometry, forced)])
+
+
 def _in_a_row(motions: list[Array], covariances: list[Array], robust: bool) -> Links:
-    count = len(motions)
-    ends = np.column_stack([np.arange(count), np.arange(1, count + 1)])
-    informations = np.asarray(np.linalg.inv(np.array(covariances).reshape(count, 3, 3)), np.float64)
-    return Links.of(ends, np.array(motions).reshape(count, 3), informations, robust)
+    joined = np.concatenate(motions)
+    ends = np.column_stack([np.arange(len(joined)), np.arange(1, len(joined) + 1)])
+    return Links.of(ends, joined, np.asarray(np.linalg.inv(np.concatenate(covariances))), robust)

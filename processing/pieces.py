@@ -18,6 +18,7 @@ from processing.open_loop import OpenLoop
 from processing.pose_graph import solve
 from processing.registration import path_starts
 from processing.scan_matching import Matcher, Scan
+from processing.sweeps import StoredScans, Sweeps
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,10 +28,10 @@ GRID_SPACING_M = 0.15  # scans closer to each other than this add nothing to a g
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The scans of a span that go into the grid: s of B beams, seen from key frames of their path."""
+    """The scans of a span that go into the grid: s, seen from key frames of their path."""
 
-    ranges: NDArray[np.float32]  # (s, B) m; +inf no return, NaN invalid
-    angles: NDArray[np.float32]  # (s, B) rad, the motion of the sweep removed
+    sweeps: Sweeps  # of the span
+    rows: Ints  # (s,) which of them
     keyframe: Ints  # (s,) of the path
     offsets: Array  # (s, 3) of the vehicle, in the frame of that key frame
 
@@ -49,37 +50,28 @@ class SolvedPiece:
     input: PieceInput
     map: PieceMap
 
-    @property
-    def scans(self) -> list[Scan]:
-        """N, of all paths' key frames."""
-        return [scan for path in self.input.paths for scan in path.scans]
+    def scan(self, index: int) -> Scan:
+        """Of one of the N key frames."""
+        p = int(np.searchsorted(self.map.firsts, index, side="right")) - 1
+        return self.input.paths[p].scans[index - int(self.map.firsts[p])]
 
     def ends(self, p: int) -> tuple[int, int]:
         """Indices of the first and last pose of path `p`."""
         return int(self.map.firsts[p]), int(self.map.firsts[p + 1]) - 1
 
 
-def cut_span(run_id: str, loop: OpenLoop, ranges: NDArray[np.float32], angles: Array, span: Span) -> tuple[Path, Sight]:
+def cut_span(run_id: str, loop: OpenLoop, span: Span) -> tuple[Path, Sight]:
     """What one span gives to its piece; the passes at its ends are key frames."""
     a, b = (int(np.searchsorted(loop.keyframes, scan)) for scan in (span.first, span.last))
     chain = loop.links[np.arange(a, b)].shifted(-a)
     wheels = loop.wheels[np.arange(a, b)].shifted(-a)
-    path = Path(run_id, np.arange(a, b + 1), loop.scans[a : b + 1], chain, wheels, np.zeros(3))
-    scans = np.arange(span.first, span.last + 1)
+    sweeps = loop.sweeps.cut(span.first, span.last)
+    scans = StoredScans(sweeps, loop.keyframes[a : b + 1] - span.first)
+    path = Path(run_id, np.arange(a, b + 1), scans, chain, wheels, np.zeros(3))
     travelled = np.append(0.0, np.cumsum(np.hypot(*loop.odometry.deltas[span.first : span.last, :2].T)))
-    shown = scans[np.unique(np.floor(travelled / GRID_SPACING_M), return_index=True)[1]]
-    points = loop.points[shown]
-    straightened = np.hypot(points[..., 0], points[..., 1])
-    bearing = np.arctan2(points[..., 1], points[..., 0])
-    returned = np.isfinite(straightened)
-    keyframe = np.clip(loop.reference[shown] - a, 0, b - a)
-    sight = Sight(
-        ranges=np.where(returned, straightened, np.where(np.isinf(ranges[shown]), np.inf, np.nan)).astype(np.float32),
-        angles=np.where(returned, bearing, angles).astype(np.float32),
-        keyframe=keyframe,
-        offsets=loop.offsets[shown],
-    )
-    return path, sight
+    rows = np.unique(np.floor(travelled / GRID_SPACING_M), return_index=True)[1]
+    shown = span.first + rows
+    return path, Sight(sweeps, rows, np.clip(loop.reference[shown] - a, 0, b - a), loop.offsets[shown])
 
 
 def split_drifts(given: PieceInput) -> list[PieceInput]:
@@ -136,6 +128,10 @@ def draw_piece(given: PieceInput, firsts: Ints, poses: Array, resolution_m: floa
     laser, ranges, angles = [], [], []
     for p, sight in enumerate(given.sights):
         laser.append(compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), given.mount))
-        ranges.append(sight.ranges)
-        angles.append(sight.angles)
+        measured = sight.sweeps.ranges[sight.rows]
+        points = sight.sweeps.straighten(measured, sight.rows)
+        returned = np.isfinite(points[..., 0])
+        bearings = np.arctan2(points[..., 1], points[..., 0])
+        ranges.append(np.where(returned, np.hypot(points[..., 0], points[..., 1]), measured))
+        angles.append(np.where(returned, bearings, sight.sweeps.angles.astype(np.float32)))
     return build_grid(np.concatenate(laser), np.concatenate(ranges), np.concatenate(angles), resolution_m)

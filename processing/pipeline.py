@@ -8,7 +8,9 @@ recordings ─ read_log ─ open_loop ─ beacons ─┐
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -24,8 +26,15 @@ from processing.edge_placement import Placed, Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
 from processing.length_placement import place_by_lengths
 from processing.occupancy_grid import Grid
-from processing.odometry import dead_reckon
-from processing.open_loop import OpenLoop, estimate_open_loop, mount_pose, odometry_at_scans
+from processing.odometry import Motions, dead_reckon
+from processing.open_loop import (
+    OpenLoop,
+    cut_segments,
+    drive_segment,
+    join_segments,
+    mount_pose,
+    odometry_at_scans,
+)
 from processing.pieces import PieceInput, SolvedPiece, cut_span, draw_piece, rename, solve_piece
 from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
@@ -33,6 +42,7 @@ from processing.recordings import group_parts
 from processing.remarks import remarks
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, Scan, match_scans
+from processing.sweeps import Sweeps, sweeps_of
 from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers
 
@@ -73,8 +83,9 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, jobs:
     """Map recordings. Raises: BadInputError: a recording is unfit, or it cannot be told which run it is."""
     parts = group_parts(recordings)
     match = MATCHERS[config.matcher]
-    with Workers(jobs) as work:
-        runs = work.map("runs", partial(drive_through, profile=profile, match=match, config=config), parts)
+    with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as scratch:
+        take_in = partial(read_run, profile=profile, config=config, scratch=Path(scratch))
+        runs = drive_through(work.map("recordings", take_in, parts), work, match)
         runs, left_out = leave_out_moved(runs)
         runs, graph, placed = map_network(runs, work, match, config)
         grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
@@ -88,7 +99,7 @@ def map_network(
     place = place_by_frames if config.assembly == "refined" else place_by_lengths
     known: dict[Piece, list[SolvedPiece]] = {}
     for review in range(MAX_REVIEWS + 1):
-        graph = build_graph([run.passes for run in runs], [len(run.loop.points) for run in runs])
+        graph = build_graph([run.passes for run in runs], [len(run.loop) for run in runs])
         names = dict(zip(graph.pieces, piece_names(graph), strict=True))
         new = [piece for piece in graph.pieces if piece not in known]
         inputs = [piece_input(names[piece], piece, runs) for piece in new]
@@ -102,19 +113,39 @@ def map_network(
     return runs, graph, placed
 
 
-def drive_through(recording: tuple[Path, ...], profile: Profile | None, match: Matcher, config: Config) -> DrivenRun:
-    """Read the parts of one recording, find its passes and estimate it open loop."""
-    run = read_log(recording[0], profile, recording[1:])
+@dataclass(frozen=True, slots=True)
+class ReadRun:
+    run: Run
+    wheels: WheelScale
+    odometry: Motions  # n - 1, between scans
+    sweeps: Sweeps  # n
+    passes: list[Pass]
+
+
+def read_run(recording: tuple[Path, ...], profile: Profile | None, config: Config, scratch: Path | None) -> ReadRun:
+    """Read the parts of one recording, put its wheels right and find its passes."""
+    run = read_log(recording[0], profile, recording[1:], scratch)
     if len(run.scans.times) < MIN_SCANS:
         raise BadInputError(f"{recording[0]}: {len(run.scans.times)} scans are too few to map")
     run, wheels = calibrate(run)
-    driven = dead_reckon(odometry_at_scans(run))
+    odometry = odometry_at_scans(run)
     passes: list[Pass] = []
     if config.method == "landmark" and len(run.tags.epcs):
         nearest = np.searchsorted((run.scans.times[1:] + run.scans.times[:-1]) / 2, run.tags.times)
-        passes = find_passes(run.tags.epcs, nearest, driven)
-    loop = estimate_open_loop(run, np.array([found.centre for found in passes], np.int64), match)
-    return DrivenRun(run, wheels, loop, passes)
+        passes = find_passes(run.tags.epcs, nearest, dead_reckon(odometry))
+    return ReadRun(run, wheels, odometry, sweeps_of(run.scans, odometry, mount_pose(run)), passes)
+
+
+def drive_through(runs: list[ReadRun], work: Workers, match: Matcher) -> list[DrivenRun]:
+    """Estimate the runs open loop; every pass becomes a key frame."""
+    cut = [cut_segments(of.sweeps, of.odometry, np.array([p.centre for p in of.passes], np.int64)) for of in runs]
+    driven = iter(work.map("runs", partial(drive_segment, match=match), [segment for of in cut for segment in of]))
+    return [
+        DrivenRun(
+            of.run, of.wheels, join_segments(of.sweeps, of.odometry, list(islice(driven, len(segments)))), of.passes
+        )
+        for of, segments in zip(runs, cut, strict=True)
+    ]
 
 
 def piece_names(graph: Graph) -> list[str]:
@@ -132,12 +163,7 @@ def piece_names(graph: Graph) -> list[str]:
 
 
 def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
-    cuts = [
-        cut_span(
-            runs[s.run].run.run_id, runs[s.run].loop, runs[s.run].run.scans.ranges, runs[s.run].run.scans.angles, s
-        )
-        for s in piece.spans
-    ]
+    cuts = [cut_span(runs[s.run].run.run_id, runs[s.run].loop, s) for s in piece.spans]
     paths, sights = (tuple(column) for column in zip(*cuts, strict=True))
     return PieceInput(name, piece, paths, sights, mount_pose(runs[piece.spans[0].run].run))
 

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import ROLES, Profile, parse_profile
+from processing.read_scans import ScanReader, Scans
 from rtlog_client.log_file import LogInfo, read_info, read_messages
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import BY_NAME, JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
@@ -29,23 +31,6 @@ Stamps = NDArray[np.int64]
 
 SCAN_TOPICS = (PRIMARY_SCAN.name, "/scan")
 BARE_PROFILE = Profile(schema=1, name="scanner at the vehicle's origin")
-
-
-@dataclass(frozen=True, slots=True)
-class Scans:
-    """n scans of B beams each in the scanner's frame; shorter scans are padded with NaN."""
-
-    stamps_ns: Stamps  # (n,) of the first ray
-    times: Array  # (n,) s, strictly rising
-    ranges: NDArray[np.float32]  # (n, B) m; +inf no return, NaN invalid
-    angle_min: float
-    angle_increment: float
-    time_increment_s: float  # between two beams of a sweep
-
-    @property
-    def angles(self) -> Array:
-        """(B,) rad, counter-clockwise."""
-        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +59,12 @@ class Run:
     ticks: int
 
 
-def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path] = ()) -> Run:
+def read_log(
+    path: Path, profile: Profile | None = None, further: Sequence[Path] = (), scratch: Path | None = None
+) -> Run:
     """Read a recording; `profile` stands in for a missing attachment, `further` are the parts of it that follow.
+
+    With a `scratch` folder, the ranges of its scans stay in a file there; without, they are in memory.
 
     Raises:
         BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders, or messages that
@@ -96,18 +85,31 @@ def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path]
         raise BadInputError(f"{path}: {scan_topic} holds 1 scan; a drive needs more")
     if encoder_topic == JOINT_STATES.name and not profile.encoders:
         raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
-    scans: list[Any] = []
+    with (
+        TemporaryDirectory() as nowhere,
+        ScanReader(path, (scratch or Path(nowhere)) / f"{info.run_id}.ranges") as scans,
+    ):
+        return _read((path, *further), info, profile, (scan_topic, encoder_topic), scans, in_memory=scratch is None)
+
+
+def _read(
+    parts: tuple[Path, ...],
+    info: LogInfo,
+    profile: Profile,
+    topics: tuple[str, str],
+    scans: ScanReader,
+    in_memory: bool,
+) -> Run:
+    (scan_topic, encoder_topic), path = topics, parts[0]
     motions: list[tuple[int, Any]] = []
     reads: list[tuple[int, str]] = []
     wheels = _wheels_of(profile) if encoder_topic == JOINT_STATES.name else _pose_of
     tick_log_times: list[int] = []
-    scan_log_times: list[int] = []
-    for topic, log_time_ns, message in _decoded((path, *further), [TICK.name, scan_topic, encoder_topic, TAGS.name]):
+    for topic, log_time_ns, message in _decoded(parts, [TICK.name, scan_topic, encoder_topic, TAGS.name]):
         if topic == TICK.name:
             tick_log_times.append(log_time_ns)
         elif topic == scan_topic:
-            scans.append(message)
-            scan_log_times.append(log_time_ns)
+            scans.add(message, log_time_ns)
         elif topic == encoder_topic:
             value = wheels(message)
             if value is not None and np.all(np.isfinite(value)):
@@ -120,7 +122,7 @@ def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path]
     reads.sort()
     motion_ns = np.array([ns for ns, _ in motions], np.int64)
     motion = np.array([value for _, value in motions], np.float64)
-    scan_ns = np.array([to_ns(scan.header.stamp) for scan in scans], np.int64)
+    scan_ns = scans.stamps_ns
     rising_motion_ns, rising_scan_ns = rising_stamps(motion_ns), rising_stamps(scan_ns)
     if rising_motion_ns[0] > rising_scan_ns[-1] or rising_scan_ns[0] > rising_motion_ns[-1]:
         raise BadInputError(f"{path}: by their stamps, {scan_topic} and {encoder_topic} have no time in common")
@@ -131,14 +133,10 @@ def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path]
     have_wheels = encoder_topic == JOINT_STATES.name
     return Run(
         run_id=info.run_id,
-        sha256=_digest((path, *further)),
+        sha256=_digest(parts),
         profile=profile,
-        scans=_stack_scans(path, scans, scan_ns, scan_times),
-        scan_ticks=(
-            np.searchsorted(tick_log_times, scan_log_times, side="right") - 1
-            if tick_log_times
-            else np.arange(len(scans))
-        ),
+        scans=scans.scans(scan_times, in_memory),
+        scan_ticks=scans.ticks(tick_log_times),
         epoch_ns=epoch_ns,
         motion_ns=motion_ns,
         motion_times=motion_times,
@@ -148,7 +146,7 @@ def read_log(path: Path, profile: Profile | None = None, further: Sequence[Path]
             np.array([(ns - epoch_ns) * 1e-9 for ns, _ in reads], np.float64),
             np.array([epc for _, epc in reads], np.str_),
         ),
-        ticks=info.message_counts.get(TICK.name, len(scans)),
+        ticks=info.message_counts.get(TICK.name, len(scan_ns)),
     )
 
 
@@ -254,27 +252,3 @@ def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:
 def _pose_of(message: Any) -> tuple[float, float, float]:
     position, q = message.pose.pose.position, message.pose.pose.orientation
     return position.x, position.y, float(np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)))
-
-
-def _stack_scans(path: Path, messages: list[Any], stamps_ns: Stamps, times: Array) -> Scans:
-    increments = {round(float(m.angle_increment), 7) for m in messages}
-    starts = {round(float(m.angle_min), 5) for m in messages}
-    if len(increments) > 1 or len(starts) > 1:
-        raise BadInputError(f"{path}: the scanner's angles change within the recording; record each setting by itself")
-    if not abs(increments.copy().pop()) > 1e-5:
-        raise BadInputError(f"{path}: the scans have an angle_increment of zero")
-    beams = max(len(m.ranges) for m in messages)
-    if beams < 10:
-        raise BadInputError(f"{path}: scans of {beams} beams cannot be matched")
-    ranges = np.full((len(messages), beams), np.nan, np.float32)
-    for row, message in zip(ranges, messages, strict=True):
-        row[: len(message.ranges)] = message.ranges
-        if message.range_max > 0:
-            row[row >= message.range_max] = np.inf
-        row[(row <= 0) | (row < message.range_min)] = np.nan  # nearer than can be measured
-    last = messages[-1]
-    increment, start, time_increment = float(last.angle_increment), float(last.angle_min), float(last.time_increment)
-    if increment < 0:  # a scanner mounted upside down, or a driver that counts clockwise
-        ranges, start, increment = ranges[:, ::-1], start + increment * (beams - 1), -increment
-        time_increment = -time_increment  # the first ray is now the last beam
-    return Scans(stamps_ns, times, ranges, start, increment, time_increment)

@@ -5,6 +5,7 @@ vehicle was heading. Both are found by matching the two scans at the passes from
 both ways. Paths that cannot lie in the same drift, though they join the same tags, are told apart here.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +58,7 @@ def _weigh_headings(reference: Scan, current: Scan, mount: Array) -> list[tuple[
 
 def path_starts(
     chains: list[Links],  # per path
-    scans: list[list[Scan]],  # per path
+    scans: list[Sequence[Scan]],  # per path
     ends: list[tuple[int | None, int | None]],  # nodes at the first and last key frame of each path
     mount: Array,
 ) -> tuple[list[Array], list[int]]:
@@ -86,7 +87,7 @@ def _places(
     a: int,
     b: int,
     poses: list[Array],
-    scans: list[list[Scan]],
+    scans: list[Sequence[Scan]],
     ends: list[tuple[int | None, int | None]],
     mount: Array,
 ) -> list[Array]:

@@ -12,10 +12,11 @@ from processing.edge_placement import Placed
 from processing.geometry import align, compose
 from processing.graph import Graph, build_graph
 from processing.pieces import SolvedPiece, solve_piece
-from processing.pipeline import Config, DrivenRun, drive_through, piece_input, piece_names
+from processing.pipeline import Config, DrivenRun, drive_through, piece_input, piece_names, read_run
 from processing.scan_matching import match_scans
 from processing.simulation.simulate import simulate
 from processing.tum import read_tum
+from processing.workers import Workers
 
 SMALL_WORLD = """
 schema = 1
@@ -88,7 +89,8 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def drive_both(world: Path) -> list[DrivenRun]:
-    return [drive_through((world / f"small-{run}.mcap",), None, match_scans, Config()) for run in ("around", "back")]
+    runs = [read_run((world / f"small-{run}.mcap",), None, Config(), None) for run in ("around", "back")]
+    return drive_through(runs, Workers(1), match_scans)
 
 
 @pytest.fixture(scope="session")
@@ -116,7 +118,7 @@ def truth(small_world: Path, driven: list[DrivenRun]) -> list[np.ndarray]:
 
 
 def solve_pieces(driven: list[DrivenRun]) -> tuple[Graph, list[SolvedPiece]]:
-    graph = build_graph([of.passes for of in driven], [len(of.loop.points) for of in driven])
+    graph = build_graph([of.passes for of in driven], [len(of.loop) for of in driven])
     inputs = [piece_input(name, piece, driven) for name, piece in zip(piece_names(graph), graph.pieces, strict=True)]
     return graph, [part for given in inputs for part in solve_piece(given, match_scans)]
 

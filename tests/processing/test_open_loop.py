@@ -9,12 +9,14 @@ from numpy.testing import assert_allclose
 
 from processing.geometry import accumulate, compose, inverse, relative, wrap_angle
 from processing.odometry import Motions, dead_reckon
-from processing.open_loop import estimate_open_loop, interpolate_poses, mount_pose, odometry_at_scans, undistort
+from processing.open_loop import estimate_open_loop, interpolate_poses, mount_pose, odometry_at_scans
 from processing.pipeline import DrivenRun
-from processing.read_log import Run, Scans, read_log
+from processing.read_log import Run, read_log
+from processing.read_scans import Scans
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Scan, match_scans
 from processing.simulation.simulate import simulate
+from processing.sweeps import sweeps_of
 from processing.tum import read_tum
 
 NOBODY = np.empty(0, np.int64)
@@ -90,14 +92,14 @@ def test_a_sweep_in_motion_is_straightened(clockwise: bool) -> None:
 
     raw = np.stack([np.float32(ranges) * np.cos(angles), np.float32(ranges) * np.sin(angles)], axis=-1)
     assert off_walls(raw) > 0.1
-    assert off_walls(undistort(scans, odometry, mount)) < 0.01
+    assert off_walls(sweeps_of(scans, odometry, mount).points(slice(None))) < 0.01
 
 
 def test_beams_without_a_range_stay_without(driven: list[DrivenRun]) -> None:
     run = first_scans(driven[0].run, 3)
     ranges = run.scans.ranges.copy()
     ranges[1, 10:13] = [np.nan, np.inf, -np.inf]
-    points = undistort(replace(run.scans, ranges=ranges), odometry_at_scans(run), mount_pose(run))
+    points = sweeps_of(replace(run.scans, ranges=ranges), odometry_at_scans(run), mount_pose(run)).points(slice(None))
     assert np.all(np.isnan(points[1, 10:13]))
     assert np.array_equal(np.isnan(points[..., 0]), ~np.isfinite(ranges))
 
@@ -108,8 +110,8 @@ def test_a_clock_set_back_does_not_bend_the_sweeps(driven: list[DrivenRun]) -> N
     odometry = odometry_at_scans(run)
     times = run.scans.times.copy()
     times[41:50] = times[40] + 1e-4 * np.arange(1, 10)
-    squeezed = undistort(replace(run.scans, times=times), odometry, mount)
-    assert np.nanmax(np.abs(squeezed - undistort(run.scans, odometry, mount))) < 0.05
+    squeezed = sweeps_of(replace(run.scans, times=times), odometry, mount).points(slice(None))
+    assert np.nanmax(np.abs(squeezed - sweeps_of(run.scans, odometry, mount).points(slice(None)))) < 0.05
 
 
 def test_without_noise_a_drive_of_200_m_ends_where_it_should(
@@ -152,17 +154,17 @@ def test_key_frames_are_where_they_are_asked_for_and_where_the_view_changes(driv
         loop = of.loop
         assert {found.centre for found in of.passes} <= set(loop.keyframes.tolist())
         assert loop.keyframes[0] == 0
-        assert loop.keyframes[-1] == len(loop.points) - 1
+        assert loop.keyframes[-1] == len(loop) - 1
         assert np.all(np.diff(loop.keyframes) > 0)
         assert len(loop.scans) == len(loop.keyframes) == len(loop.links) + 1 == len(loop.wheels) + 1
         steps = np.hypot(*loop.links.motions[:, :2].T)
         assert steps.max() < 1.5
-        assert len(steps) < len(loop.points) / 1.5
+        assert len(steps) < len(loop) / 1.5
 
 
 def test_every_scan_hangs_on_a_key_frame_before_it(driven: list[DrivenRun]) -> None:
     loop = driven[0].loop
-    assert np.all(loop.keyframes[loop.reference] <= np.arange(len(loop.points)))
+    assert np.all(loop.keyframes[loop.reference] <= np.arange(len(loop)))
     assert np.all(np.diff(loop.reference) >= 0)
     assert_allclose(loop.offsets[loop.keyframes], 0, atol=1e-12)
     assert_allclose(loop.poses[loop.keyframes][:, :2], loop.keyframe_poses[:, :2], atol=1e-9)

@@ -17,7 +17,7 @@ STRAIGHT = np.column_stack([np.arange(0, 80, 0.75), np.zeros(107), np.zeros(107)
 
 
 def scan_of(of: DrivenRun, k: int) -> Scan:
-    return prepare_scan(of.loop.points[k], of.run.scans.angle_min, of.run.scans.angle_increment)
+    return of.loop.sweeps.scan(k)
 
 
 def bow(height_m: float) -> np.ndarray:
@@ -107,7 +107,7 @@ def test_a_path_in_another_drift_does_not() -> None:
 
 def test_paths_both_ways_through_an_edge_start_where_they_did(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
     """Each path of an edge in the frame of its first, open loop: what map_piece begins with."""
-    graph = build_graph([of.passes for of in driven], [len(of.loop.points) for of in driven])
+    graph = build_graph([of.passes for of in driven], [len(of.loop) for of in driven])
     shared = [piece for piece in graph.pieces if piece.j is not None and len(piece.spans) > 1]
     assert any(a.start == b.end for piece in shared for a in piece.spans[:1] for b in piece.spans[1:])
     for piece in shared:
@@ -121,7 +121,7 @@ def test_two_drifts_between_the_same_tags_become_two_pieces(driven: list[DrivenR
     """With only two of its tags read, the ring is two drifts from the one to the other: east and west."""
     tags = sorted({found.epc for found in driven[0].passes})
     seen = [[found for found in of.passes if found.epc in (tags[0], tags[2])] for of in driven]
-    graph = build_graph(seen, [len(of.loop.points) for of in driven])
+    graph = build_graph(seen, [len(of.loop) for of in driven])
     (edge,) = [piece for piece in graph.pieces if piece.j is not None]
     assert len(edge.spans) >= 2
     east, west = split_drifts(piece_input("0-1", edge, driven))

@@ -9,7 +9,9 @@ from processing.geometry import compose, relative, wrap_angle
 from processing.odometry import Motions
 from processing.open_loop import OpenLoop
 from processing.pose_graph import Links
-from processing.read_log import Run, Scans, TagReadings
+from processing.read_log import Run, TagReadings
+from processing.read_scans import Scans
+from processing.sweeps import Sweeps
 from processing.trajectory import run_trajectory
 
 EPOCH_NS = 1_767_592_800 * 10**9
@@ -48,9 +50,8 @@ def a_run(
     )
     loop = OpenLoop(
         odometry=Motions(np.zeros((count - 1, 3)), np.zeros((count - 1, 3, 3))),
-        points=np.zeros((count, 2, 2), np.float32),
+        sweeps=Sweeps(np.zeros((count, 2), np.float32), np.zeros((count, 3)), np.zeros(3), 0.0, 0.1, 0.0),
         keyframes=np.arange(count),
-        scans=[],
         links=NO_LINKS,
         wheels=NO_LINKS,
         reference=np.arange(count),
@@ -134,9 +135,8 @@ def test_scans_between_key_frames_go_with_theirs() -> None:
     reference = np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
     sparse = OpenLoop(
         odometry=loop.odometry,
-        points=loop.points,
+        sweeps=loop.sweeps,
         keyframes=np.array([0, 5]),
-        scans=[],
         links=NO_LINKS,
         wheels=NO_LINKS,
         reference=reference,

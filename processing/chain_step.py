@@ -1,0 +1,68 @@
+"""One step of the chain of key frames, compiled: what happens for every scan must not wait for small arrays in Python.
+
+The same as `compose`, `compose_jacobians`, `through_mount`, `consistent` and `fuse` do for many steps at once; the
+tests hold the two against each other.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from processing.fusion import CHI_SQUARED_3_999
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True)
+def join(a: Array, b: Array) -> Array:
+    """a ⊕ b of two poses (3,)."""
+    c, s, turn = math.cos(a[2]), math.sin(a[2]), a[2] + b[2]
+    turn = -((-turn + math.pi) % (2 * math.pi) - math.pi)
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], turn])
+
+
+@njit(cache=True)
+def carry(pose: Array, covariance: Array, step: Array, noise: Array) -> tuple[Array, Array]:
+    """A pose (3,) and its covariance (3, 3) after one more step (3,) with covariance `noise`."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    j_pose = np.array([[1.0, 0.0, -s * step[0] - c * step[1]], [0.0, 1.0, c * step[0] - s * step[1]], [0.0, 0.0, 1.0]])
+    j_step = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return join(pose, step), j_pose @ covariance @ j_pose.T + j_step @ noise @ j_step.T
+
+
+@njit(cache=True)
+def to_laser(mount: Array, to_vehicle: Array, motion: Array) -> Array:
+    """A motion (3,) of the vehicle as one of the laser at `mount`; `to_vehicle` is the inverse of the mount."""
+    return join(to_vehicle, join(motion, mount))
+
+
+@njit(cache=True)
+def to_vehicle(mount: Array, from_laser: Array, motion: Array, covariance: Array) -> tuple[Array, Array]:
+    """A motion (3,) of the laser and its covariance (3, 3) as the vehicle's; `from_laser` is the inverse of the
+    mount.
+    """
+    moved = join(join(mount, motion), from_laser)
+    c, s, cm, sm = math.cos(moved[2]), math.sin(moved[2]), math.cos(mount[2]), math.sin(mount[2])
+    jacobian = np.array(
+        [[cm, -sm, s * mount[0] + c * mount[1]], [sm, cm, -c * mount[0] + s * mount[1]], [0.0, 0.0, 1.0]]
+    )
+    return moved, jacobian @ covariance @ jacobian.T
+
+
+@njit(cache=True)
+def weigh(
+    expected: Array, expected_covariance: Array, gate: float, matched: Array, matched_covariance: Array
+) -> tuple[bool, Array, Array]:
+    """Whether a match agrees with the odometry within its gate, and the motion that both give (eq. 3, 4)."""
+    innovation = matched - expected
+    innovation[2] = -((-innovation[2] + math.pi) % (2 * math.pi) - math.pi)
+    spread = gate * expected_covariance + matched_covariance
+    agrees = innovation @ np.linalg.solve(spread, innovation) <= CHI_SQUARED_3_999
+    gain = np.ascontiguousarray(np.linalg.solve(expected_covariance + matched_covariance, expected_covariance).T)
+    fused = expected + gain @ innovation
+    fused[2] = -((-fused[2] + math.pi) % (2 * math.pi) - math.pi)
+    kept = np.eye(3) - gain
+    doubt = kept @ expected_covariance @ kept.T + gain @ matched_covariance @ gain.T
+    return bool(agrees), fused, doubt

@@ -1,0 +1,79 @@
+"""The ranges of a run in a scratch file, so that a drive of any length takes no memory.
+
+In: scans one after the other, as they are read. Out: `Ranges`, rows of which are read back as arrays when a stage
+needs them. It is small itself, and goes to other processes as it is.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+Rows = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """n scans of B beams [m]; +inf no return, NaN invalid."""
+
+    path: Path
+    shape: tuple[int, int]  # (n, B)
+    first: int = 0  # row of the file
+    is_mirrored: bool = False  # the file holds the last beam first
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, which: int | slice | Ints) -> Rows:
+        """Rows (k, B), or one (B,). Rows that follow each other are read in one go."""
+        rows = np.arange(len(self))[which]
+        wanted = np.atleast_1d(rows)
+        breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
+        found = np.empty((len(wanted), self.shape[1]), np.float32)
+        with self.path.open("rb", buffering=0) as file:
+            for start, end in zip([0, *breaks], [*breaks, len(wanted)], strict=True):
+                if start < end:
+                    file.seek((self.first + int(wanted[start])) * found.itemsize * self.shape[1])
+                    file.readinto(found[start:end].data)
+        found = found[:, ::-1] if self.is_mirrored else found
+        return found if np.ndim(rows) else found[0]
+
+    def cut(self, first: int, last: int) -> "Ranges":
+        """Rows `first` to `last`, the last included."""
+        return replace(self, shape=(last + 1 - first, self.shape[1]), first=self.first + first)
+
+
+class RangeFile:
+    """Writes the file. Scans shorter than the longest are padded with NaN."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.rows, self.beams = path, 0, 0
+        self._file = path.open("w+b")
+
+    def append(self, ranges: Rows) -> None:
+        """Append a scan (b,)."""
+        if len(ranges) > self.beams:
+            self._widen(len(ranges))
+        elif len(ranges) < self.beams:
+            ranges = np.concatenate([ranges, np.full(self.beams - len(ranges), np.nan, np.float32)])
+        self._file.write(ranges.astype(np.float32, copy=False).tobytes())
+        self.rows += 1
+
+    def _widen(self, beams: int) -> None:
+        """Rare, so not in pieces: a scan is longer than all before it."""
+        wide = np.full((self.rows, beams), np.nan, np.float32)
+        self._file.seek(0)
+        wide[:, : self.beams] = np.frombuffer(self._file.read(), np.float32).reshape(self.rows, self.beams)
+        self._file.seek(0)
+        self._file.write(wide.tobytes())
+        self.beams = beams
+
+    def finish(self, is_mirrored: bool) -> Ranges:
+        """What was written, ready to be read."""
+        self._file.flush()
+        return Ranges(self.path, (self.rows, self.beams), is_mirrored=is_mirrored)
+
+    def close(self) -> None:
+        self._file.close()

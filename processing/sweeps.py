@@ -1,0 +1,144 @@
+"""Sweeps: the scans of a run as the other stages use them, made when they are asked for.
+
+In: ranges, and how the vehicle moved. Out: points of a sweep as if all its beams had been measured at its first ray, or
+a `Scan` ready for matching. Law: only the ranges are kept; what can be computed from them in 0.1 ms is not.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import overload
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from processing.odometry import Motions
+from processing.range_file import Ranges
+from processing.read_scans import Scans
+from processing.scan_matching import Scan, prepare_scan
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Points = NDArray[np.float32]
+
+AT_ONCE = 64  # scans straightened together
+
+
+@dataclass(frozen=True, slots=True)
+class Sweeps:
+    """n sweeps of B beams."""
+
+    ranges: NDArray[np.float32] | Ranges  # (n, B) m; +inf no return, NaN invalid
+    velocities: Array  # (n, 3) of the vehicle at each sweep: ahead, left [m/s], turn [rad/s]
+    mount: Array  # (3,) scanner in the vehicle
+    angle_min: float
+    angle_increment: float
+    time_increment_s: float  # between two beams
+
+    def __len__(self) -> int:
+        return len(self.velocities)
+
+    @property
+    def angles(self) -> Array:
+        """(B,) rad."""
+        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1], dtype=np.float64)
+
+    def points(self, rows: slice | Ints) -> Points:
+        """Points (k, B, 2) in the scanner's frame, the motion during the sweep removed; NaN where there is no range.
+
+        While the mirror turns, the vehicle drives on: at 20 km/h and 15 ms a sweep that is 8 cm.
+        """
+        return self.straighten(self.ranges[rows], rows)
+
+    def straighten(self, ranges: NDArray[np.float32], rows: slice | Ints) -> Points:
+        """`points` of rows whose ranges (k, B) were read already."""
+        since = self.time_increment_s * np.arange(ranges.shape[1], dtype=np.float64)
+        if self.time_increment_s < 0:
+            since -= since[-1]
+        out = np.empty((*ranges.shape, 2), np.float32)
+        _straighten(np.ascontiguousarray(ranges), self.angles, since, self.velocities[rows], self.mount, out)
+        return out
+
+    def scan(self, row: int) -> Scan:
+        """Ready for matching."""
+        return prepare_scan(self.points(slice(row, row + 1))[0], self.angle_min, self.angle_increment)
+
+    def scans(self, rows: Ints) -> Iterator[Scan]:
+        """The same, of many."""
+        for start in range(0, len(rows), AT_ONCE):
+            for points in self.points(rows[start : start + AT_ONCE]):
+                yield prepare_scan(points, self.angle_min, self.angle_increment)
+
+    def cut(self, first: int, last: int) -> "Sweeps":
+        """Sweeps `first` to `last`, the last included."""
+        kept = slice(first, last + 1)
+        ranges = self.ranges.cut(first, last) if isinstance(self.ranges, Ranges) else self.ranges[kept]
+        return replace(self, ranges=ranges, velocities=self.velocities[kept])
+
+
+def sweeps_of(scans: Scans, odometry: Motions, mount: Array) -> Sweeps:
+    """The sweeps of a run; `odometry` (n - 1) between them."""
+    velocities = np.zeros((len(scans.times), 3))
+    if len(scans.times) > 1:
+        seconds = np.diff(scans.times)
+        seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
+        velocities[:-1] = odometry.deltas / seconds[:, None]
+        velocities[-1] = velocities[-2]
+    return Sweeps(scans.ranges, velocities, mount, scans.angle_min, scans.angle_increment, scans.time_increment_s)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredScans(Sequence[Scan]):
+    """Some of the sweeps, as scans ready for matching."""
+
+    sweeps: Sweeps
+    rows: Ints  # (K,)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, which: int) -> Scan: ...
+    @overload
+    def __getitem__(self, which: slice) -> "StoredScans": ...
+    def __getitem__(self, which: int | slice) -> "Scan | StoredScans":
+        if isinstance(which, slice):
+            return StoredScans(self.sweeps, self.rows[which])
+        return self.sweeps.scan(int(self.rows[which]))
+
+    def __iter__(self) -> Iterator[Scan]:
+        return self.sweeps.scans(self.rows)
+
+    def detached(self) -> "StoredScans":
+        """The same without the sweeps before and after them: less to carry to another process."""
+        first, last = int(self.rows[0]), int(self.rows[-1])
+        return StoredScans(self.sweeps.cut(first, last), self.rows - first)
+
+
+@njit(cache=True)
+def _straighten(
+    ranges: NDArray[np.float32],  # (n, B)
+    angles: Array,  # (B,)
+    since: Array,  # (B,) s, of each beam since the first ray
+    velocities: Array,  # (n, 3)
+    mount: Array,  # (3,)
+    out: Points,  # (n, B, 2)
+) -> None:
+    cosines, sines = np.cos(angles), np.sin(angles)
+    mx, my = mount[0], mount[1]
+    cm, sm = math.cos(mount[2]), math.sin(mount[2])
+    for k in range(ranges.shape[0]):
+        vx, vy, turn = velocities[k]
+        for i in range(ranges.shape[1]):
+            r = np.float64(ranges[k, i])
+            if not math.isfinite(r):
+                out[k, i, 0] = out[k, i, 1] = np.nan
+                continue
+            x, y, t = r * cosines[i], r * sines[i], since[i]
+            if t != 0.0:
+                c, s = math.cos(turn * t), math.sin(turn * t)
+                # where the scanner is by then, seen from where it was: ⊖mount ⊕ (v t ⊕ mount)
+                dx, dy = vx * t + c * mx - s * my - mx, vy * t + s * mx + c * my - my
+                x, y = cm * dx + sm * dy + c * x - s * y, -sm * dx + cm * dy + s * x + c * y
+            out[k, i, 0], out[k, i, 1] = x, y
