@@ -63,7 +63,9 @@ def run(profile: Profile, profile_toml: str) -> None:
     log.info("boot %s of %s: %s", info.boot_id, info.vehicle, ", ".join(device.name for device in devices))
     publisher = PublishingProcess(info)
     realtime = become_realtime()  # after the other process, which must not inherit it; its sender, though, must
-    log.info("real time: %s", "; ".join(f"{key} {answer}" for key, answer in realtime.items()))
+    granted = not any("not " in answer for answer in realtime.values())
+    answers = "; ".join(f"{key} {answer}" for key, answer in realtime.items())
+    log.log(logging.INFO if granted else logging.WARNING, "real time: %s", answers)
     publisher.outbox.start()
     try:
         sample_for_ever(profile.tick_period_s, devices, publisher, realtime, stopped=lambda: bool(stop_requests))

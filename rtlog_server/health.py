@@ -78,6 +78,7 @@ def _server_status(report: Report, before: Report | None) -> Any:
         "lateness_p50_ms": f"{lateness.p50_s * 1e3:.3f}",
         "lateness_p99_ms": f"{lateness.p99_s * 1e3:.3f}",
         "lateness_max_ms": f"{lateness.max_s * 1e3:.3f}",
+        "lateness_up_to_ms": " ".join(f"{edge * 1e3:.3f}:{count}" for edge, count in lateness.histogram),
         **report.realtime,
     }
     return _status(level, "server", message, "", values)

@@ -40,7 +40,11 @@ def test_diagnostics_level_each_device_and_the_ticks() -> None:
     assert laser.hardware_id == "4711"
     assert {pair.key: pair.value for pair in laser.values}["scans lost"] == "0"
     assert encoders.message == "no answer from left_wheel"
-    assert {pair.key: pair.value for pair in server.values}["dropped_ticks"] == "7"
+    values = {pair.key: pair.value for pair in server.values}
+    assert values["dropped_ticks"] == "7"
+    assert values["overruns"] == "2"
+    assert values["lateness_up_to_ms"] == "0.100:500 250.000:100"
+    assert values["scheduler"] == "SCHED_FIFO 80"
 
 
 def test_diagnostics_warn_of_a_device_that_delivers_and_is_not_well() -> None:
