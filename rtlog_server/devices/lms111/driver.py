@@ -22,7 +22,7 @@ from rtlog_server.devices.device import Device, DeviceError
 from rtlog_server.devices.laser import Scan
 from rtlog_server.devices.lms111.cola import ColaError, Dialect
 from rtlog_server.devices.lms111.connection import PROBE_S, Connection, NoAnswerError, open_connection
-from rtlog_server.devices.lms111.protocol import AUTHORISED_CLIENT, MEASURING, STATES
+from rtlog_server.devices.lms111.protocol import AUTHORISED_CLIENT, MEASURING, SCAN_CONFIGURATION_FAULTS, state_name
 from rtlog_server.devices.lms111.scan_data import ScanData
 from rtlog_server.devices.lms111.sweep import FIELD_START_1E4DEG, FIELD_STOP_1E4DEG, STATUS, period_us, to_scan
 
@@ -133,7 +133,7 @@ class Lms111(Device[Scan]):
         except NoAnswerError as error:
             raise DeviceError(f"{silent}, and no answer") from error
         if state != MEASURING:
-            raise DeviceError(f"{silent}: it is {STATES.get(state, state)}")
+            raise DeviceError(f"{silent}: it is {state_name(state)}")
         now_ns = time.monotonic_ns()
         if now_ns - self._quiet_since_ns > QUIET_S * 1e9:
             raise DeviceError(f"{self._where} measures but has sent no scan for {QUIET_S} s")
@@ -155,7 +155,8 @@ class Lms111(Device[Scan]):
         if not _near(present[:3], (frequency_centihz, *sector[:2])):  # the sector in it is fixed
             code = ask("sMN mLMPsetscancfg", frequency_centihz, *sector, limit_s=MOTOR_ANSWER_S)[0]
             if code != 0:
-                raise DeviceError(f"{self._where} refuses {wanted.scan_frequency_hz} Hz (code {code})")
+                fault = SCAN_CONFIGURATION_FAULTS.get(code, "unknown")
+                raise DeviceError(f"{self._where} refuses {wanted.scan_frequency_hz} Hz: {fault} (code {code})")
         if not _near(ask("sRN LMPoutputRange"), sector):
             ask("sWN LMPoutputRange", *sector)
         # echoes, remission and its width; of encoder, position, name, comment and time nothing; every scan
@@ -168,7 +169,7 @@ class Lms111(Device[Scan]):
         ask("sMN LMCstartmeas", limit_s=MOTOR_ANSWER_S)  # whether it worked is told by the state
         deadline_ns = time.monotonic_ns() + int(MEASURING_S * 1e9)
         while (state := ask("sRN STlms"))[0] != MEASURING:
-            self.message = f"{self._where} is {STATES.get(state[0], state[0])}"
+            self.message = f"{self._where} is {state_name(state[0])}"
             if self.pause(POLL_S) or time.monotonic_ns() > deadline_ns:
                 raise DeviceError(f"{self.message} and does not come to measure")
         self.diagnostics["temperature"] = "outside of its range" if state[1] else "ok"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtlog_server.devices.lms111.connection import Connection, RefusedError, open_connection
-from rtlog_server.devices.lms111.protocol import CONTAMINATION, DEVICE_ERROR, MEASURING, STATES
+from rtlog_server.devices.lms111.protocol import CONTAMINATION, DEVICE_ERROR, MEASURING, state_name
 from rtlog_server.devices.lms111.sweep import AHEAD_1E4DEG, STATUS
 
 
@@ -44,7 +44,7 @@ class ScannerIdentity:
         if self.outside_temperature:
             return "outside of its temperature range: wait for the heater, or cool it"
         if self.state != MEASURING:
-            return f"is {STATES.get(self.state, f'in state {self.state}')}, does not measure yet"
+            return f"is {state_name(self.state)}, does not measure yet"
         return ""
 
 

@@ -64,6 +64,8 @@ LAYOUTS = {
     "sEA LIDoutputstate": "B",
 }
 
+SCAN_CONFIGURATION_FAULTS = {1: "frequency", 2: "resolution", 3: "frequency and resolution", 4: "sector", 5: "other"}
+
 STATES = {
     0: "undefined",
     1: "initialising",
@@ -125,6 +127,11 @@ class Command:
 
     name: str
     values: tuple[Any, ...] = ()
+
+
+def state_name(state: int) -> str:
+    """What STlms says, in words that follow "it is"."""
+    return STATES.get(state, f"in state {state}")
 
 
 def reply_name(command: str) -> str:

@@ -243,11 +243,21 @@ def test_only_what_differs_is_written(open_peer: OpenPeer) -> None:
         ({"sEN LMDscandata": (0,)}, "refuses to stream"),
         (
             {"sRN LMPscancfg": (2500, 1, 2500, 0, 0), "sMN mLMPsetscancfg": (3, 2500, 1, 2500, 0, 0)},
-            "refuses 50 Hz (code 3)",
+            "refuses 50 Hz: frequency and resolution (code 3)",
         ),
+        ({"sRN STlms": (0, 0, "", "", 0, 0, 0)}, "is undefined"),
+        ({"sRN STlms": (1, 0, "", "", 0, 0, 0)}, "is initialising"),
+        ({"sRN STlms": (2, 0, "", "", 0, 0, 0)}, "is in configuration"),
+        ({"sRN STlms": (3, 0, "", "", 0, 0, 0)}, "is idle"),
+        ({"sRN STlms": (4, 0, "", "", 0, 0, 0)}, "is rotating"),
+        ({"sRN STlms": (5, 1, "", "", 0, 0, 0)}, "is in preparation"),
+        ({"sRN STlms": (6, 0, "", "", 0, 0, 0)}, "is ready"),
+        ({"sRN STlms": (8, 0, "", "", 0, 0, 0)}, "is in state 8"),
     ],
 )
-def test_a_device_that_refuses_says_so(present: dict[str, Any], message: str, open_peer: OpenPeer) -> None:
+def test_a_device_that_refuses_or_is_not_ready_says_so(
+    present: dict[str, Any], message: str, open_peer: OpenPeer
+) -> None:
     _, driver = open_peer(telegrams(REPLIES | present))
     wait_until(lambda: message in driver.message)
 
