@@ -65,13 +65,14 @@ def wait_scans(driver: Lms111) -> list[Scan]:
 
 def lose(emulator: Lms111Emulator, number: int) -> None:
     """Most connections are reset or closed; some in the middle of a telegram or of garbage; some devices go away."""
+    away_s = 1.0 + number % 7 / 2  # long enough for the driver to try but once a second
     if number % 50 == 0:
         emulator.go_silent()
-        time.sleep(1.0)
+        time.sleep(away_s)
         emulator.go_silent(False)
     elif number % 50 == 1:
         emulator.refuse()
-        time.sleep(0.3)
+        time.sleep(away_s)
         emulator.refuse(False)
     elif number % 50 == 2:
         emulator.power_cycle(off_s=0.3)

@@ -73,7 +73,7 @@ class Lms111(Device[Scan]):
         event = self._connection.receive(self._scan_due_ns)
         if event is not None and isinstance(event[0], ScanData):
             self._take(event[0], event[1], self._connection)
-        elif time.monotonic_ns() > self._scan_due_ns:
+        if time.monotonic_ns() > self._scan_due_ns:
             self._enquire(self._connection)
 
     def disconnect(self) -> None:

@@ -60,6 +60,7 @@ class EmulatedScanner:
         serial_no: as the scans tell it.
         speaks_cola_b: what its port speaks at first.
         clock_offset_us: what its clock counts at the first power-up; from the second on it is 0, as in a real one.
+        telegrams: what its counters of telegrams and scans count at the first power-up.
         clock_drift_ppm: how much faster its clock goes than ours.
         start_s: how long it takes to measure, from power-up and from LMCstartmeas.
     """
@@ -72,9 +73,10 @@ class EmulatedScanner:
         clock_offset_us: int,
         clock_drift_ppm: float,
         start_s: float,
+        telegrams: int = 0,
     ) -> None:
         self._serial_no = serial_no
-        self._next_offset_us = clock_offset_us
+        self._next_offset_us, self._next_telegrams = clock_offset_us, telegrams
         self._rate_per_ns = (1 + clock_drift_ppm * 1e-6) / 1000
         self._start_ns = int(start_s * 1e9)
         self._kept = {"EIHstCola": (int(speaks_cola_b),)}
@@ -88,7 +90,8 @@ class EmulatedScanner:
         self._variables = FACTORY | FIXED | self._kept
         self._measuring_from_ns: int | None = now_ns + self._start_ns
         self._preparing = INITIALISING
-        self._telegram_counter = self._scan_counter = 0
+        self._telegram_counter = self._scan_counter = self._next_telegrams
+        self._next_telegrams = 0
         self._index_ns = now_ns
         self.newest: ScanData | None = None
         self.hang_up()

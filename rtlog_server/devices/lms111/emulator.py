@@ -44,7 +44,7 @@ class Lms111Emulator:
         host: the address to listen on.
         port: 0 takes any.
         dialect: what the port speaks, "A" or "B".
-        serial_no, clock_offset_us, clock_drift_ppm, start_s: as in `EmulatedScanner`.
+        serial_no, clock_offset_us, clock_drift_ppm, start_s, telegrams: as in `EmulatedScanner`.
 
     Raises:
         OSError: the port cannot be opened.
@@ -60,9 +60,10 @@ class Lms111Emulator:
         clock_offset_us: int = 0,
         clock_drift_ppm: float = 0.0,
         start_s: float = 0.0,
+        telegrams: int = 0,
     ) -> None:
-        now_ns = time.monotonic_ns()
-        self._scanner = EmulatedScanner(now_ns, serial_no, dialect == "B", clock_offset_us, clock_drift_ppm, start_s)
+        clock = clock_offset_us, clock_drift_ppm
+        self._scanner = EmulatedScanner(time.monotonic_ns(), serial_no, dialect == "B", *clock, start_s, telegrams)
         self._listener: socket.socket | None = socket.create_server((host, port))
         self.address: tuple[str, int] = self._listener.getsockname()[:2]
         self._client: socket.socket | None = None

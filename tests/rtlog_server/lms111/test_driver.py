@@ -16,7 +16,9 @@ Open = Feed = Callable[..., Any]
 
 @pytest.mark.parametrize("dialect", ["A", "B"])
 def test_scans_arrive_as_they_were_measured(dialect: str, open_drive: Open, feed: Feed) -> None:
-    emulator = Lms111Emulator(dialect=dialect, serial_no=14090017, clock_offset_us=2**32 - 500_000, clock_drift_ppm=50)
+    """Across a wrap of the device's count of microseconds and of its counters."""
+    clock = {"clock_offset_us": 2**32 - 500_000, "clock_drift_ppm": 50}
+    emulator = Lms111Emulator(dialect=dialect, serial_no=14090017, telegrams=65_520, **clock)
     drive = open_drive(emulator.address)
     assert emulator.wait_streaming(2)
     feeder = feed(emulator)
@@ -34,6 +36,7 @@ def test_scans_arrive_as_they_were_measured(dialect: str, open_drive: Open, feed
     assert drive.driver.identity == {"model": "LMS111", "firmware": "V1.80.2", "serial_number": "14090017"}
     assert drive.driver.diagnostics["dialect"] == f"CoLa {dialect}"
     assert drive.driver.diagnostics["temperature"] == "ok"
+    assert [scan.telegram_counter for scan in scans] == [(65_521 + k) % 65_536 for k in range(len(scans))]
     assert drive.driver.diagnostics["scans lost"] == "0"
     assert drive.driver.diagnostics["garbage [bytes]"] == "0"
     assert drive.driver.message == "connected"

@@ -184,6 +184,20 @@ def test_scans_in_one_piece_with_the_registration(
     assert driver.diagnostics["scans lost"] == str(lost)
 
 
+@needs_captures
+def test_the_same_scan_again_and_again_is_no_sign_of_life(open_peer: OpenPeer) -> None:
+    scan, repetitions = scan_telegrams(0), iter(range(100))
+
+    def repeat(connection: socket.socket) -> None:
+        for _ in repetitions:
+            connection.sendall(scan)
+            time.sleep(0.02)
+
+    _, driver = open_peer(telegrams(REPLIES), repeat)
+    wait_until(lambda: "no scan for 0.5 s" in driver.message)
+    assert driver.diagnostics["scans"] == "1"
+
+
 def wait_counters(driver: Lms111, count: int) -> list[int]:
     """The telegram counters of the first scans."""
     counters: list[int] = []
