@@ -26,6 +26,8 @@ from rtlog_server.topics import JOINT_STATES
 
 STAMP_NS = 10_000_000  # tolerance: encoders on a bus are latched one after the other, and share a stamp
 COUNTS = 1.5
+SPEED_NS = 100_000_000  # before a reading, over which its speed is taken
+BROUGHT_NS = 5_000_000  # by which a driver may bring a reading to its stamp, at that speed
 
 
 def compare_encoders(
@@ -87,7 +89,9 @@ class _Wheel:
             self._track.angle(name, self._report.recorded_ns(stamp_ns + offset_ns))
             for offset_ns in range(-STAMP_NS, STAMP_NS + 1, STAMP_NS // 2)
         ]
+        before = self._track.angle(name, self._report.recorded_ns(stamp_ns - SPEED_NS))
         slack = COUNTS * math.tau / self._encoder.counts_per_turn
+        slack += abs(around[2] - before) * BROUGHT_NS / SPEED_NS
         self._ends[1:] = [(stamp_ns, angle_rad)]
         off = round((angle_rad - around[2]) / math.tau)
         if self._turns_off is None:

@@ -173,7 +173,7 @@ def _judge_scans(
                 what, detail = "stamp", f"{error_ns * 1e-6:+.2f} ms"
         if what:
             tick = int(expected[number])
-            cause = causes.of(result.device, stamp_ns, ticks.at(tick))
+            cause = causes.of(result.device, stamp_ns, ticks.at(int(latest[number])))
             recorded_ns = report.recorded_ns(stamp_ns)
             result.differences.append(Difference(result.device, what, ticks.index(tick), recorded_ns, cause, detail))
     result.differences.reverse()

@@ -14,7 +14,7 @@ from typing import Any
 from hw_profiles.errors import BadInputError
 from rtlog_client.log_file import read_info, read_messages
 from rtlog_server.messages import decode, to_ns
-from rtlog_server.topics import AUXILIARY_SCAN, PRIMARY_SCAN, TAGS
+from rtlog_server.topics import AUXILIARY_SCAN, PRIMARY_SCAN, TAGS, TICK
 
 # Topics of a device, by its name; of several, a recording holds one: other systems know a single `/scan`.
 TOPICS = {
@@ -31,7 +31,7 @@ class Span:
 
     start_ns: int
     end_ns: int
-    first_tick_ns: int  # of the recording
+    first_tick_ns: int  # of the recording; without ticks, its start
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -50,7 +50,8 @@ def read_span(recording: Path, start_s: float, duration_s: float | None) -> Span
     if start_ns >= end_ns:
         length_s = (info.end_ns - info.start_ns) * 1e-9
         raise BadInputError(f"{recording}: nothing to replay after {start_s:g} s; it is {length_s:.1f} s long")
-    return Span(start_ns, end_ns, info.start_ns)
+    first_tick = next(read_messages(recording, [TICK.name]), None)
+    return Span(start_ns, end_ns, info.start_ns if first_tick is None else first_tick.log_time_ns)
 
 
 def read_events(recording: Path, devices: Collection[str], span: Span) -> Iterator[Event]:
