@@ -7,6 +7,8 @@ the other. What error the edges have gathered shows as kinks at the nodes: piece
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from processing.assembly import Assembly, assemble_paper, turn_from_headings
 from processing.edge_placement import Placed, Placement, find_boundary, lay_side_by_side, link_nodes, remark_parts
@@ -16,21 +18,30 @@ from processing.pieces import SolvedPiece
 from processing.scan_matching import Matcher
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Key = tuple[int, int]  # of a pass: run, scan
+
+SHORT_M = 2.0  # two tags this close are one node of the assembly: the centres of their clouds jitter by as much
 
 
 def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher) -> Placement:
-    """The paper's assembly of all edges; spurs are hung on what they share a pass with, or else a tag."""
-    edges = [p for p, piece in enumerate(solved) if piece.input.piece.j is not None]
+    """The paper's assembly of all edges; spurs are hung on what they share a pass with, or else a tag.
+
+    So are edges too short to have a direction: two tags on one bolt are one node, and a drive by them one turn.
+    """
+    joins = [p for p, piece in enumerate(solved) if piece.input.piece.j is not None]
     local = [relative(_own_frame(piece), piece.map.poses) for piece in solved]
+    edges = [p for p in joins if _length(solved[p], local[p]) > SHORT_M]
+    short = [p for p in joins if p not in edges]
+    united = _unite_nodes([_nodes_of(solved[p]) for p in short], len(graph.nodes))
     links = _links_of_passes(solved)
-    assembly = _assemble(solved, edges, local, graph, links)
+    assembly = _assemble(solved, edges, short, united, local, links)
     frames, parts = [np.zeros(3) for _ in solved], [-1 for _ in solved]
     passes: dict[Key, tuple[Array, int]] = {}  # pose in the atlas, part
     for p in edges:
-        i, j = (assembly.positions[node] for node in _nodes_of(solved[p]))
+        i, j = (assembly.positions[united[node]] for node in _nodes_of(solved[p]))
         frames[p] = np.array([*i, np.arctan2(*(j - i)[::-1])])
-        parts[p] = int(assembly.parts[_nodes_of(solved[p])[0]])
+        parts[p] = int(assembly.parts[united[_nodes_of(solved[p])[0]]])
         for key, _, index in _passes_of(solved[p]):
             passes.setdefault(key, (compose(frames[p], local[p][index]), parts[p]))
     waiting = [p for p in range(len(solved)) if p not in edges]
@@ -89,6 +100,18 @@ def _nodes_of(edge: SolvedPiece) -> tuple[int, int]:
     return i, j
 
 
+def _length(edge: SolvedPiece, local: Array) -> float:
+    """From pass to pass of the first path, in the edge's own frame."""
+    a, b = edge.ends(0)
+    return float(np.hypot(*(local[b, :2] - local[a, :2])))
+
+
+def _unite_nodes(pairs: list[tuple[int, int]], count: int) -> Ints:
+    """For each node (count,) the number of the node of the assembly that it belongs to."""
+    i, j = np.array(pairs, np.int64).reshape(-1, 2).T
+    return np.asarray(connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(count, count)))[1], np.int64)
+
+
 def _own_frame(piece: SolvedPiece) -> Array:
     """The frame of a piece, in that of its poses; of an edge, from the first path's pass of i to that of j (figure
     6c).
@@ -115,20 +138,32 @@ def _passes_of(piece: SolvedPiece) -> list[tuple[Key, int, int]]:
 def _assemble(
     solved: list[SolvedPiece],
     edges: list[int],
+    short: list[int],
+    united: Ints,  # (nodes,) node of the assembly
     local: list[Array],
-    graph: Graph,
     links: list[tuple[Key, Key, Array]],
 ) -> Assembly:
-    ends = np.array([_nodes_of(solved[p]) for p in edges], np.int64).reshape(-1, 2)
-    lengths = []
+    ends = united[np.array([_nodes_of(solved[p]) for p in edges], np.int64).reshape(-1, 2)]
+    lengths = [_length(solved[p], local[p]) for p in edges]
     headings: dict[Key, list[tuple[int, float]]] = {}
     for number, p in enumerate(edges):
-        a, b = solved[p].ends(0)
-        lengths.append(float(np.hypot(*(local[p][b, :2] - local[p][a, :2]))))
         for key, _, index in _passes_of(solved[p]):
             headings.setdefault(key, []).append((number, local[p][index, 2]))
     # A drive from one edge into the next: the pass is one pose, seen from both edges, and δ of eq. 5 is zero.
     joints = [(key, key, 0.0) for key, pair in headings.items() if len(pair) == 2]
+    # A drive past tags that are one node: δ is what it turned from the first to the last of them.
+    turned = {
+        first: (last, float(local[p][b, 2] - local[p][a, 2]))
+        for p in short
+        for passes in [_passes_of(solved[p])]
+        for (first, _, a), (last, _, b) in zip(passes[::2], passes[1::2], strict=True)
+    }
+    for first in sorted(headings.keys() & turned.keys()):
+        last, delta = turned[first]
+        while last not in headings and last in turned:
+            last, further = turned[last]
+            delta += further
+        joints.append((first, last, delta))
     # Passes that no drive joins: δ is what their scans say.
     joints += [(u, v, float(motion[2])) for u, v, motion in links]
     turns = [
@@ -139,7 +174,9 @@ def _assemble(
         if a != b
     ]
     turn_edges = np.array([(a, b) for a, b, _ in turns], np.int64).reshape(-1, 2)
-    return assemble_paper(len(graph.nodes), ends, np.array(lengths), turn_edges, np.array([t for _, _, t in turns]))
+    return assemble_paper(
+        int(united.max(initial=-1)) + 1, ends, np.array(lengths), turn_edges, np.array([t for _, _, t in turns])
+    )
 
 
 def _remarks(solved: list[SolvedPiece], edges: list[int], assembly: Assembly) -> list[str]:

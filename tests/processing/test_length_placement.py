@@ -117,6 +117,27 @@ def test_a_length_that_cannot_hold_is_named(
     assert "cannot all hold" in remark
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_tags_on_one_bolt_bend_nothing(
+    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, seed: int
+) -> None:
+    """Each tag has another beside it; the centres of both clouds lie where they like within a metre of it."""
+    rng, doubled = np.random.default_rng(seed), []
+    for of in driven:
+        passes = []
+        for found in of.passes:
+            at = int(np.searchsorted(of.loop.keyframes, found.centre))
+            for beside, shift in zip(("", "B"), rng.choice([-1, 0, 1], 2, replace=False), strict=True):
+                passes.append(replace(found, epc=found.epc + beside, centre=int(of.loop.keyframes[at + shift])))
+        doubled.append(replace(of, passes=sorted(passes, key=lambda found: found.centre)))
+    graph, pieces = solve_runs(doubled)
+    assert len(graph.nodes) == 8
+    placement = place_by_lengths(pieces, graph, match_scans)
+    assert {piece.part for piece in placement.pieces} == {0}
+    _, off = move_into_world(placement.pieces, driven)
+    assert np.sqrt(np.mean(off**2)) < 1.0
+
+
 def test_runs_without_a_common_tag_are_parts_side_by_side_and_told(
     driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move
 ) -> None:
