@@ -2,7 +2,7 @@
 
 In: the reader's address or serial port from the profile. Out: `TagSample`s as they arrive.
 
-    console        we → reader   log in, `set_up`; then its tag list, once a second
+    console        we → reader   log in, `set_up`; then its tag list, and whether it still reads, once a second
     push           reader → us   tag stream or notify; it connects when it likes, at the latest with the first read
 
 While the reader has no connection to us (firewall, wrong `stream_host`, no network on a serial line) its tag list is
@@ -17,7 +17,7 @@ from collections import Counter
 
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices.alien import protocol
-from rtlog_server.devices.alien.console import REPLY_S, Console
+from rtlog_server.devices.alien.console import Console
 from rtlog_server.devices.alien.identity import read_identity
 from rtlog_server.devices.alien.listener import PushListener
 from rtlog_server.devices.alien.protocol import AlienError
@@ -27,7 +27,9 @@ from rtlog_server.devices.alien.tag_memory import TagMemory
 from rtlog_server.devices.device import Device, DeviceError
 from rtlog_server.devices.rfid import TagSample
 
-ALIVE_S = 1.0  # the tag list is asked for this often
+ALIVE_S = 0.5  # it is asked for something this often: the tag list, or
+CHECK_S = 1.0  # whether it still reads by itself: one that was off for a moment, or that someone else has set, does not
+SILENT_S = 1.5  # it answers from memory, at once
 POLL_S = 0.1  # and this often while nothing can be pushed
 COUNTED = ("streams", "strangers refused")
 DEAD_PUSH_LISTS = 3  # in succession that told of reads while a connection stood open and told nothing
@@ -45,8 +47,7 @@ class Alr9650(Device[TagSample]):
         self._push_address = ""
         self._setup = Setup("", (), "")
         self._memory = TagMemory()
-        self._asked_at = 0.0
-        self._heard_at = 0.0
+        self._asked_at = self._heard_at = self._checked_at = 0.0
         self._awaiting_reply = False
         self._last_list: list[str] = []
         self._overtaken = 0  # lists in succession that told of reads, and the push did not
@@ -64,7 +65,7 @@ class Alr9650(Device[TagSample]):
         self._setup = set_up(console, self._push_address)
         self._selector.register(console.link, selectors.EVENT_READ)
         self._awaiting_reply, self._last_list, self._overtaken = False, [], 0
-        self._asked_at = 0.0
+        self._asked_at, self._checked_at = 0.0, time.monotonic()
 
     def read(self) -> None:
         console, listener, selector = self._console, self._listener, self._selector
@@ -73,12 +74,10 @@ class Alr9650(Device[TagSample]):
         for key, _ in selector.select(POLL_S / 2):
             if key.fileobj is console.link:
                 self._take_replies(console)
-            elif (
-                listener is not None
-                and isinstance(key.fileobj, socket.socket)
-                and self._take_lines(listener.receive(key.fileobj))
-            ):
-                self._overtaken = 0
+            elif listener is not None and isinstance(key.fileobj, socket.socket):
+                was_open = listener.is_open
+                if self._take_lines(listener.receive(key.fileobj)) or listener.is_open != was_open:
+                    self._overtaken = 0
         self._keep_asking(console)
         self._tell_health()
 
@@ -107,11 +106,13 @@ class Alr9650(Device[TagSample]):
     def _keep_asking(self, console: Console) -> None:
         now = time.monotonic()
         if self._awaiting_reply:
-            if now - max(self._asked_at, self._heard_at) > REPLY_S:
-                raise DeviceError(f"{console.link.where}: the reader has been silent for {REPLY_S:.0f} s")
+            if now - max(self._asked_at, self._heard_at) > SILENT_S:
+                raise DeviceError(f"{console.link.where}: the reader has been silent for {SILENT_S:.1f} s")
         elif now - self._asked_at >= (ALIVE_S if self._pushing else POLL_S):
-            console.send("get TagList")
+            check = now - self._checked_at >= CHECK_S
+            console.send("get AutoMode" if check else "get TagList")
             self._asked_at, self._awaiting_reply = now, True
+            self._checked_at = now if check else self._checked_at
 
     def _take_replies(self, console: Console) -> None:
         replies = console.receive()
@@ -119,9 +120,10 @@ class Alr9650(Device[TagSample]):
         for reply in replies:
             self._awaiting_reply = False
             self.heard()
-            if protocol.is_error(reply):
-                continue
-            if self._take_list(reply.removeprefix("TagList =").split("\n")):
+            if reply.casefold().startswith("automode"):
+                if reply.casefold().endswith("off"):
+                    raise DeviceError(f"{console.link.where}: the reader no longer reads by itself: it is set up anew")
+            elif not protocol.is_error(reply) and self._take_list(reply.removeprefix("TagList =").split("\n")):
                 self._overtaken += 1
         if self._listener is not None and self._overtaken >= DEAD_PUSH_LISTS:
             self._listener.drop_all()

@@ -30,7 +30,7 @@ def wait_until_back(reader: Any, connects: int) -> float:
 def test_a_reader_that_lost_its_power_is_read_again_within_two_seconds(
     emulator: Alr9650Emulator, start_on_wire: Start, epcs: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(driver, "REPLY_S", 0.5)
+    monkeypatch.setattr(driver, "SILENT_S", 0.5)
     reader = start_on_wire(emulator.port)
     reader.wait_for(lambda: reader.device.connected)
     emulator.read_tag(epcs[0], count=7)
@@ -77,7 +77,7 @@ def test_a_console_that_fell_silent_is_stale_and_then_left(
     emulator: Alr9650Emulator, start_on_wire: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(driver, "ALIVE_S", 0.1)
-    monkeypatch.setattr(driver, "REPLY_S", 0.6)
+    monkeypatch.setattr(driver, "SILENT_S", 0.6)
     reader = start_on_wire(emulator.port)
     reader.wait_for(lambda: reader.device.connected)
     emulator.silent = True
@@ -86,6 +86,23 @@ def test_a_console_that_fell_silent_is_stale_and_then_left(
     assert not reader.device.connected
     emulator.silent = False
     wait_until_back(reader, 1)
+
+
+@pytest.mark.parametrize("off_s", [0.01, 0.3])
+def test_a_reader_that_was_off_for_a_moment_or_set_by_another_is_set_up_anew(
+    emulator: Alr9650Emulator, start_on_wire: Start, epcs: list[str], off_s: float
+) -> None:
+    reader = start_on_wire(emulator.port)
+    reader.wait_for(lambda: reader.device.connected)
+    emulator.power_off()
+    time.sleep(off_s)
+    emulator.power_on()
+    assert wait_until_back(reader, 1) < RETURN_S
+    emulator.configure("set AutoMode = OFF")
+    reader.wait_for(lambda: "no longer reads by itself" in reader.device.message)
+    assert wait_until_back(reader, 2) < RETURN_S
+    emulator.read_tag(epcs[0])
+    reader.wait_for_epc(epcs[0])
 
 
 def test_a_connection_that_is_reset_is_made_anew(emulator: Alr9650Emulator, start: Start, epcs: list[str]) -> None:
