@@ -22,7 +22,7 @@ from rtlog_server.devices.lms111.scan_data import ScanData
 CONNECT_S = 0.5  # on one cable; a longer wait would miss a device that comes back
 PROBE_S = 0.25
 ANSWER_S = 0.5  # the captured device answers within 5 ms, and within 15 ms when it starts to measure
-LONGEST_WAIT_S = 0.5  # to notice that nobody wants the answer any more
+LONGEST_WAIT_S = 0.1  # to notice that nobody wants the answer any more
 RECEIVE_BYTES = 65536
 WAITING_TELEGRAMS = 1024
 # In a second. A scanner sends 0.6 MB at most; what a host that stood still finds in its socket is some seconds more.
@@ -133,7 +133,7 @@ class Connection:
             return None
 
     def _fill(self, deadline_ns: int) -> None:
-        """Wait for bytes, but no longer than half a second."""
+        """Wait for bytes, but not for long."""
         wait_s = (deadline_ns - time.monotonic_ns()) * 1e-9
         try:
             self._socket.settimeout(min(max(wait_s, 1e-3), LONGEST_WAIT_S))
