@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from hw_profiles.errors import RTLogError
@@ -25,8 +24,8 @@ from rtlog_server.devices.sei.check import check_bus
 TIME_LIMIT_S = (
     5.0  # to connect: an encoder bus left at the wrong speed takes a second attempt, a scanner starts its motor
 )
-RATE_S = 2.0  # over which rates are measured, or three ticks
-RATE_TOLERANCE = 0.1
+WATCH_S = 2.0  # over which rates are measured, or three ticks
+RATE_TOLERANCE = 0.2
 POLL_S = 0.02
 
 
@@ -34,13 +33,20 @@ POLL_S = 0.02
 class Place:
     """A device as the profile has it."""
 
-    ask: Callable[[], list[Finding]]  # who it is and how; raises DeviceError if it is not there
+    ask: Callable[[Device[Any]], list[Finding]]  # who it is and how; raises DeviceError if it is not there
     rate_hz: float | None  # of its samples; None: they come when there is something to tell
     advice: str  # what to look at when it does not answer
 
 
-def check_devices(profile: Profile, time_limit_s: float = TIME_LIMIT_S) -> dict[str, list[Finding]]:
+def check_devices(
+    profile: Profile, time_limit_s: float = TIME_LIMIT_S, watch_s: float = WATCH_S
+) -> dict[str, list[Finding]]:
     """Try every device of the profile; what was found, by device.
+
+    Args:
+        profile: of the vehicle.
+        time_limit_s: to connect.
+        watch_s: how long rates are measured; three ticks at the least.
 
     Raises:
         BadInputError: the profile lacks a device section.
@@ -49,9 +55,11 @@ def check_devices(profile: Profile, time_limit_s: float = TIME_LIMIT_S) -> dict[
     devices, places = open_devices(profile), _places(profile)
     _leave_server_alone(profile)
     grid = TickGrid(time.monotonic_ns(), round(profile.tick_period_s * 1e9))
+    watch_s = max(watch_s, 3 * profile.tick_period_s)
+    for device in devices:
+        device.start(grid)
     with ThreadPoolExecutor(len(devices) or 1) as pool:
-        check = partial(_check, profile=profile, grid=grid, time_limit_s=time_limit_s)
-        findings = pool.map(lambda device: check(device, places[device.name]), devices)
+        findings = pool.map(lambda device: _check(device, places[device.name], time_limit_s, watch_s), devices)
         return {device.name: found for device, found in zip(devices, findings, strict=True)}
 
 
@@ -69,31 +77,26 @@ def _leave_server_alone(profile: Profile) -> None:
                 raise RTLogError(f"{reason}; systemctl stop rtlog-server, then check") from error
 
 
-def _check(device: Device[Any], place: Place, profile: Profile, grid: TickGrid, time_limit_s: float) -> list[Finding]:
-    device.start(grid)
-    watched = _watch(device, place, grid, time.monotonic() + time_limit_s)
+def _check(device: Device[Any], place: Place, time_limit_s: float, watch_s: float) -> list[Finding]:
+    watched = _watch(device, place, time_limit_s, watch_s)
     device.close()
-    if isinstance(profile.encoder_bus, CanBus) and device.name == "encoders":
-        from rtlog_server.devices.cia406.check import judge_bus  # here, as in open_devices
-
-        return [*judge_bus(profile.encoder_bus, profile.encoders, device.identity, device.diagnostics), *watched]
     try:
-        return [*place.ask(), *watched]  # only now: a scanner tells its serial number when it measures
+        return [*place.ask(device), *watched]  # only now: a scanner tells its serial number when it measures
     except (DeviceError, OSError) as error:
-        reason = str(error) if device.message == "connected" else device.message  # the driver tried more often
+        reason = str(error) if device.connects else device.message  # the driver tried more often
         return [Finding("reachable", reason, False, place.advice)]
 
 
-def _watch(device: Device[Any], place: Place, grid: TickGrid, deadline: float) -> list[Finding]:
+def _watch(device: Device[Any], place: Place, time_limit_s: float, watch_s: float) -> list[Finding]:
     """How it delivers."""
+    deadline = time.monotonic() + time_limit_s
     while not device.connected:
         if time.monotonic() > deadline:
             return [Finding("connected", device.message, False, place.advice)]
         time.sleep(POLL_S)
     stamps_ns: list[int] = []
     age_s = float("inf")
-    watched_s = max(RATE_S, 3e-9 * grid.period_ns)
-    deadline = time.monotonic() + watched_s
+    deadline = time.monotonic() + watch_s
     while device.connected and time.monotonic() < deadline:
         time.sleep(POLL_S)
         collected = device.collect(time.monotonic_ns())
@@ -102,14 +105,14 @@ def _watch(device: Device[Any], place: Place, grid: TickGrid, deadline: float) -
     well = device.connected and device.message == "connected"
     findings = [Finding("connected", device.message, well, "" if well else place.advice)]
     if place.rate_hz is not None:
-        findings += _judge_stream(stamps_ns, age_s, place.rate_hz, watched_s)
+        findings += _judge_stream(stamps_ns, age_s, place.rate_hz, watch_s)
     return findings
 
 
-def _judge_stream(stamps_ns: list[int], age_s: float, wanted_hz: float, watched_s: float) -> list[Finding]:
+def _judge_stream(stamps_ns: list[int], age_s: float, wanted_hz: float, watch_s: float) -> list[Finding]:
     """Rate by the samples' own stamps, and whether these follow this board's clock."""
     if len(stamps_ns) < 2:
-        return [Finding("rate", f"{len(stamps_ns)} samples in {watched_s:.0f} s", False, "the cable, and its load")]
+        return [Finding("rate", f"{len(stamps_ns)} samples in {watch_s:.0f} s", False, "the cable, and its load")]
     rate_hz = (len(stamps_ns) - 1) / ((stamps_ns[-1] - stamps_ns[0]) * 1e-9)
     well = abs(rate_hz - wanted_hz) <= RATE_TOLERANCE * wanted_hz
     advice = "" if well else "samples are lost or late: the cable, the network's load, other clients of the device"
@@ -136,24 +139,30 @@ def _scanner(laser: Laser) -> Place:
     settings = laser.device
     assert settings is not None  # checked by the caller
     advice = f"power, cable; ping {settings.host}; CoLa port {settings.port} (2111 or 2112)"
-    return Place(partial(check_scanner, settings), settings.scan_frequency_hz, advice)
+    return Place(lambda _: check_scanner(settings), settings.scan_frequency_hz, advice)
 
 
 def _encoders(profile: Profile, bus: SeiBus | CanBus) -> Place:
     rate_hz = 1 / profile.tick_period_s
     if isinstance(bus, SeiBus):
         advice = f"adapter, encoders' power, addresses; ls -l {bus.port}; group dialout"
-        return Place(partial(check_bus, bus, profile.encoders), rate_hz, advice)
+        return Place(lambda _: check_bus(bus, profile.encoders), rate_hz, advice)
     advice = "encoders' power, node ids, terminators, bit rate"
     if bus.interface == "socketcan":
         advice += f"; ip -details link show {bus.channel}"
     elif bus.interface == "slcan":
         advice += f"; ls -l {bus.channel}; group dialout"
-    return Place(list, rate_hz, advice)
+
+    def ask_driver(device: Device[Any]) -> list[Finding]:
+        from rtlog_server.devices.cia406.check import judge_bus  # here, as in open_devices
+
+        return judge_bus(bus, profile.encoders, device)
+
+    return Place(ask_driver, rate_hz, advice)
 
 
 def _reader(settings: RfidDevice) -> Place:
     advice = f"power, cable; ls -l {settings.serial_port}; group dialout"
     if not settings.serial_port:
         advice = f"power, cable; ping {settings.host}; telnet {settings.host} {settings.port}; user and password"
-    return Place(partial(check_reader, settings), None, advice)
+    return Place(lambda _: check_reader(settings), None, advice)

@@ -19,7 +19,7 @@ Found = dict[tuple[str, str], Finding]
 
 def check(profile: Profile, time_limit_s: float = 5.0) -> Found:
     """The findings by device and subject."""
-    results = check_devices(profile, time_limit_s)
+    results = check_devices(profile, time_limit_s, watch_s=1.0)
     return {(device, finding.subject): finding for device, findings in results.items() for finding in findings}
 
 
@@ -92,7 +92,8 @@ def test_a_reader_that_refuses_us_says_so(drive: Any, drive_profile: Path) -> No
     text = drive_profile.read_text()
     port = drive.places["rfid_port"]
     assert f"port = {port} }}" in text
-    found = check(parse_profile(text.replace(f"port = {port} }}", f'port = {port}, password = "wrong" }}'), "test"))
+    profile = parse_profile(text.replace(f"port = {port} }}", f'port = {port}, password = "wrong" }}'), "test")
+    found = check(profile, time_limit_s=3.0)
     assert wrong(found) == [("rfid", "reachable")]
     assert "password" in found["rfid", "reachable"].found
 
@@ -122,3 +123,14 @@ def test_encoders_on_can_are_asked_by_their_driver(drive: Any, drive_profile: Pa
         found = check(profile)
     assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "connected")]
     assert "node id 9" in found["encoders", "identity of right_wheel"].advice
+
+
+def test_a_can_interface_that_is_not_there(drive: Any, drive_profile: Path) -> None:
+    bus = 'kind = "can"\ninterface = "slcan"\nchannel = "/dev/no-adapter"'
+    text, count = re.subn(r"kind = .*\nport = .*", bus, drive_profile.read_text())
+    assert count == 1
+    profile = parse_profile(text.replace("address = 0", "address = 5"), "test")
+    found = check(profile, time_limit_s=3.0)
+    assert wrong(found) == [("encoders", "reachable")]
+    assert "/dev/no-adapter: cannot open the CAN interface" in found["encoders", "reachable"].found
+    assert "ls -l /dev/no-adapter" in found["encoders", "reachable"].advice

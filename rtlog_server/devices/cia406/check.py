@@ -2,16 +2,19 @@
 `rtlog-server check`. A bus has no second place from which to ask: the driver itself asks each node who it is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from hw_profiles.profile import CanBus, Encoder
+from rtlog_server.devices.device import Device, DeviceError
+from rtlog_server.devices.encoders import EncoderReading
 from rtlog_server.devices.finding import Finding
 
 
-def judge_bus(
-    bus: CanBus, encoders: Sequence[Encoder], identity: Mapping[str, str], diagnostics: Mapping[str, str]
-) -> list[Finding]:
-    """Rows from a driver's `identity` and `diagnostics`."""
+def judge_bus(bus: CanBus, encoders: Sequence[Encoder], driver: Device[EncoderReading]) -> list[Finding]:
+    """Rows from what the driver has in `identity` and `diagnostics`. Raises: DeviceError: it never came to run."""
+    if not driver.connects:
+        raise DeviceError(driver.message)
+    identity, diagnostics = driver.identity, driver.diagnostics
     findings = [_judge_controller(bus, diagnostics.get("controller", "not told"))]
     for encoder in encoders:
         subject, state = f"identity of {encoder.name}", diagnostics.get(encoder.name, "silent")
