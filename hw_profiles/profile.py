@@ -229,12 +229,13 @@ def _problems(profile: Profile) -> Iterator[str]:
 
 def _bus_problems(bus: SeiBus | CanBus, encoders: list[Encoder]) -> Iterator[str]:
     """What makes the encoders none that this bus can have, or the bus none that can be opened."""
-    kind, first, last = ("an SEI bus", 0, 14) if isinstance(bus, SeiBus) else ("a CAN bus", 1, 127)
+    is_sei = isinstance(bus, SeiBus)
+    kind, first, last, most = ("an SEI bus", 0, 14, 1 << 16) if is_sei else ("a CAN bus", 1, 127, (1 << 32) - 1)
     for index, encoder in enumerate(encoders):
         if encoder.address is None or not first <= encoder.address <= last:
             yield f"encoders[{index}].address is {encoder.address}; an encoder on {kind} has one in {first} … {last}"
-        if isinstance(bus, SeiBus) and encoder.counts_per_turn > 65536:
-            yield f"encoders[{index}].counts_per_turn is {encoder.counts_per_turn}; on an SEI bus it is 65536 or less"
+        if encoder.counts_per_turn > most:
+            yield f"encoders[{index}].counts_per_turn is {encoder.counts_per_turn}; on {kind} it is {most} or less"
     addresses = [encoder.address for encoder in encoders]
     if len(set(addresses)) != len(addresses):
         yield f"encoders share an address on the bus: {addresses}"

@@ -92,7 +92,9 @@ class CanPort:
         if message.is_error_frame:
             self._report(message)
             return None
-        if message.is_remote_frame or message.is_extended_id or message.is_fd or len(message.data) > 8:
+        if message.is_remote_frame or message.is_extended_id or not 0 <= message.arbitration_id < 1 << 11:
+            return None
+        if message.is_fd or len(message.data) > 8:
             return None
         return Frame(message.arbitration_id, bytes(message.data)), arrived_ns
 

@@ -31,6 +31,7 @@ def emulator(bus: CanBus) -> Iterator[CanBusEmulator]:
 def node(bus: CanBus, emulator: CanBusEmulator) -> Iterator[canopen.RemoteNode]:
     """The emulator's node, as canopen's master sees it."""
     with canopen.Network() as network:
+        network.NOTIFIER_CYCLE = 0.02  # which is how long it takes to disconnect
         network.connect(interface="virtual", channel=bus.channel)
         remote = canopen.RemoteNode(5, canopen.ObjectDictionary())
         remote.sdo.RESPONSE_TIMEOUT = 5.0
