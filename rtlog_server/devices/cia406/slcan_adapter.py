@@ -11,38 +11,25 @@ import contextlib
 import os
 import select
 import time
-import tty
 from pathlib import Path
 
 from rtlog_server.devices.cia406.protocol import Frame
+from rtlog_server.devices.pty_link import PtyLink
 
 LONGEST_LINE = 64
 
 
 class SlcanAdapter:
-    """Open from construction to `close()`. Raises: OSError: the link cannot be made, or a file is in its way."""
+    """Plugged in from construction to `close()`. Raises: OSError: the link cannot be made, or a file is in its way."""
 
     def __init__(self, link: Path) -> None:
-        if link.exists() and not link.is_symlink():
-            raise FileExistsError(f"{link} is in the way and no symbolic link")
-        self._link = link
-        self._master, self._slave = os.openpty()  # the slave end stays open: without any, the master reads EIO
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._terminal = os.ttyname(self._slave)
+        self._terminal = PtyLink(link)
         self._received = bytearray()
         self._is_open = False
-        beside = link.with_name(f".{link.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(self._terminal)
-        beside.replace(link)
 
     def close(self) -> None:
-        """The adapter is pulled: the terminal hangs up, its name is gone."""
-        if self._link.is_symlink() and str(self._link.readlink()) == self._terminal:
-            self._link.unlink()
-        os.close(self._slave)
-        os.close(self._master)
+        """The adapter is pulled."""
+        self._terminal.unplug()
 
     def send(self, frame: Frame) -> int:
         """Pass a frame on to the host; one that does not read loses it."""
@@ -52,13 +39,12 @@ class SlcanAdapter:
 
     def write(self, data: bytes) -> None:
         """Any bytes to the host."""
-        with contextlib.suppress(BlockingIOError):
-            os.write(self._master, data)
+        self._terminal.write(data)
 
     def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
         """The host's next frame and its arrival; None: none came within the time."""
-        if self._received.find(b"\r") < 0 and select.select([self._master], [], [], timeout_s)[0]:
-            self._received += os.read(self._master, 4096)
+        if self._received.find(b"\r") < 0 and select.select([self._terminal.master], [], [], timeout_s)[0]:
+            self._received += os.read(self._terminal.master, 4096)
         text, end, rest = self._received.partition(b"\r")
         if not end:
             del self._received[:-LONGEST_LINE]
