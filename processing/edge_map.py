@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from processing.geometry import accumulate, relative
 from processing.pose_graph import CORNER, Links, Solution, solve
 from processing.relocation import NO_LINKS, relocate_stretch
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 from processing.strong_links import (
     HOP_INLIERS,
     LOOP_INLIERS,

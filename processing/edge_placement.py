@@ -19,7 +19,8 @@ from processing.graph import Graph
 from processing.pieces import SolvedPiece, bend_to
 from processing.pose_graph import Links
 from processing.registration import register_passes
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
 
 Array = NDArray[np.float64]

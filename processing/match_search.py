@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.scan_match import ScanMatch
-from processing.scan_matching import Scan, match_scans
+from processing.scan_matching import match_scans
+from processing.scan_walls import Scan
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from processing.beacons import Pass
 from processing.geometry import relative
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
 
 Array = NDArray[np.float64]

@@ -24,7 +24,8 @@ from processing.match_search import search_match
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
-from processing.scan_matching import Matcher, Scan, match_scans
+from processing.scan_matching import Matcher, match_scans
+from processing.scan_walls import Scan
 from processing.sweeps import StoredScans, Sweeps, sweeps_of
 
 Array = NDArray[np.float64]

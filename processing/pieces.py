@@ -17,7 +17,8 @@ from processing.occupancy_grid import Grid, build_grid
 from processing.open_loop import OpenLoop
 from processing.pose_graph import solve
 from processing.registration import path_starts
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 from processing.sweeps import StoredScans, Sweeps
 
 Array = NDArray[np.float64]

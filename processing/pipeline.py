@@ -41,7 +41,8 @@ from processing.read_log import Run, read_log
 from processing.recordings import group_parts
 from processing.remarks import remarks
 from processing.scan_match import ScanMatch
-from processing.scan_matching import Matcher, Scan, match_scans
+from processing.scan_matching import Matcher, match_scans
+from processing.scan_walls import Scan
 from processing.sweeps import Sweeps, sweeps_of
 from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers

@@ -16,7 +16,8 @@ from processing.geometry import accumulate, compose, inverse
 from processing.match_search import agreement, search_match
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import CLOSEST_M, Scan, match_scans
+from processing.scan_matching import CLOSEST_M, match_scans
+from processing.scan_walls import Scan
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from processing.geometry import compose, inverse, relative, transform, wrap_angle
 from processing.match_search import score
 from processing.pose_graph import Links
-from processing.scan_matching import Scan
+from processing.scan_walls import Scan
 from processing.strong_links import KeyFrames, match_vehicles
 
 Array = NDArray[np.float64]

@@ -15,23 +15,20 @@ the first guess and a large covariance (`UNSEEN_VARIANCE`).
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from processing.scan_match import ScanMatch
+from processing.scan_walls import RANGE_NOISE_M, Scan
 
 Array = NDArray[np.float64]
 
-RANGE_NOISE_M = 0.012  # statistical error of an LMS111, data sheet
-WALL_LENGTH_M = 0.35  # a normal is fitted to at least this much wall, where there are enough points
-MAX_NEIGHBOURS = 12
-GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ see no wall, or see it at less than 10°
 UNSEEN_VARIANCE = 1e4  # m², rad²: the match says nothing about this direction
 CORRELATION = 2.0  # neighbouring beams share roughness and calibration errors: so many of them count as one
 PRETENCE = 3.0  # information less than so many times what noisy normals pretend is none
+SETTLED = 0.05  # standard deviations: steps smaller than this do not matter
 MIN_MATCHED = 10  # points, and
 MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
 CLOSEST_M = 0.25  # pairs of points further apart than this are no pairs, once the guess has become good
@@ -39,93 +36,7 @@ LEVER_M = 5.0  # a typical distance to the walls
 MODEL_NOISE_M = 0.002  # what matching on other points of a rough wall leaves, however many beams see it
 
 
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """A scan ready for matching, in its own frame: x ahead of the scanner, y left; B beams by ascending bearing."""
-
-    points: Array  # (B, 2) m; without a return: NaN
-    normals: Array  # (B, 2) towards the scanner; NaN where no wall could be fitted
-    variances: Array  # (B, 2): of the point off its line [m²], of the normal's direction [rad²]
-    angle_min: float
-    angle_increment: float
-    bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
-
-
 Matcher = Callable[[Scan, Scan, Array], ScanMatch]  # reference, current, first guess (3,)
-
-
-@njit(cache=True)
-def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array, variances: Array) -> float:
-    """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are.
-
-    Returns: how far off its beam's bearing a point lies at most [rad].
-    """
-    count, bent = points.shape[0], 0.0
-    for i in range(count):
-        if math.isfinite(points[i, 0]):
-            off = math.atan2(points[i, 1], points[i, 0]) - (angle_min + i * increment)
-            bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
-    joined = np.zeros(count, np.bool_)  # with the next beam: do the two see one wall?
-    for i in range(count - 1):
-        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
-        reach = math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
-        joined[i] = math.sqrt(dx * dx + dy * dy) < max(0.15, GRAZING * increment * reach)  # NaN compares false
-    for i in range(count):
-        normals[i, 0] = normals[i, 1] = np.nan
-        variances[i, 0] = variances[i, 1] = np.nan
-        if i == 0 or i == count - 1 or not (joined[i - 1] and joined[i]):
-            continue
-        # Grow to both sides, a beam at a time; the moments are those about point i.
-        x0, y0 = points[i, 0], points[i, 1]
-        low = high = i
-        grow_low = grow_high = True
-        sx = sy = sxx = sxy = syy = 0.0
-        while (grow_low or grow_high) and high - low < 2 * MAX_NEIGHBOURS:
-            if grow_low:
-                grow_low = low > 0 and joined[low - 1] and i - low < MAX_NEIGHBOURS
-                if grow_low:
-                    low -= 1
-                    dx, dy = points[low, 0] - x0, points[low, 1] - y0
-                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
-            if grow_high:
-                grow_high = high < count - 1 and joined[high] and high - i < MAX_NEIGHBOURS
-                if grow_high:
-                    high += 1
-                    dx, dy = points[high, 0] - x0, points[high, 1] - y0
-                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
-            if high - low >= 4:
-                dx, dy = points[high, 0] - points[low, 0], points[high, 1] - points[low, 1]
-                if dx * dx + dy * dy > WALL_LENGTH_M * WALL_LENGTH_M:
-                    break
-        n = high - low + 1
-        if n < 4:
-            continue
-        sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
-        # The larger eigenvalue of the scatter, and its direction: the wall's.
-        half = 0.5 * (sxx - syy)
-        root = math.sqrt(half * half + sxy * sxy)
-        along = 0.5 * (sxx + syy) + root
-        across = max(sxx + syy - along, 0.0)
-        if along < 9 * across or along < 1e-6:
-            continue  # a blob, not a wall
-        wx, wy = (root + half, sxy) if half > 0 else (sxy, root - half)
-        length = math.sqrt(wx * wx + wy * wy)
-        nx, ny = -wy / length, wx / length
-        if nx * x0 + ny * y0 > 0:
-            nx, ny = -nx, -ny
-        noise = max(across / (n - 2), RANGE_NOISE_M * RANGE_NOISE_M)
-        normals[i, 0], normals[i, 1] = nx, ny
-        variances[i, 0] = noise
-        variances[i, 1] = noise / along
-    return bent
-
-
-def prepare_scan(points: Array, angle_min: float, angle_increment: float) -> Scan:
-    """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    normals, variances = np.empty_like(points), np.empty_like(points)
-    bent_rad = _fit_walls(points, angle_min, angle_increment, normals, variances)
-    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad)
 
 
 @njit(cache=True)
@@ -271,6 +182,7 @@ def _gauss_newton(
         _eigen(information * scale, values, vectors)
         step[:] = 0.0
         covariance[:] = 0.0
+        restless = 0.0  # the largest step, in standard deviations
         for k in range(3):
             v = vectors[:, k]
             false = 0.0
@@ -281,18 +193,19 @@ def _gauss_newton(
                     false += v[a] * v[b] * false_information[a, b] * scale[a, b]
             seen = values[k] > PRETENCE * false and values[k] > 1e-3
             variance = CORRELATION / (values[k] - false) + MODEL_NOISE_M * MODEL_NOISE_M if seen else UNSEEN_VARIANCE
+            if seen:
+                restless = max(restless, abs(pull / values[k]) / math.sqrt(variance))
             for a in range(3):
                 if seen:
                     step[a] += v[a] * lever[a] * pull / values[k]
                 for b in range(3):
                     covariance[a, b] += variance * v[a] * v[b] * scale[a, b]
         motion -= step
-        moved = math.hypot(step[0], step[1])
-        if reach <= CLOSEST_M and moved < 2e-4 and abs(step[2]) < 2e-5:
+        if reach <= CLOSEST_M and restless < SETTLED:
             converged = True
             break
         if iteration == max_iterations - 1:  # points that change their partners for ever, by less than it matters
-            converged = moved < 2e-3 and abs(step[2]) < 5e-4
+            converged = restless < 10 * SETTLED
     motion[2] = math.atan2(math.sin(motion[2]), math.cos(motion[2]))
     rms = math.sqrt(sum_squares / sum_weights) if matched else math.inf
     return valid, visible, matched, rms, converged

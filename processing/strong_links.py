@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from processing.geometry import compose, inverse, relative
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

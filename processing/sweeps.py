@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.odometry import Motions
 from processing.range_file import Ranges
 from processing.read_scans import Scans
-from processing.scan_matching import Scan, prepare_scan
+from processing.scan_walls import Scan, prepare_scan
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -15,7 +15,8 @@ from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
 from processing.open_loop import mount_pose
 from processing.registration import SEEN_M, register_passes
-from processing.scan_matching import Matcher, Scan
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
 from processing.trajectory import keyframe_poses
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from processing.pieces import SolvedPiece
 from processing.pipeline import DrivenRun
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch
-from processing.scan_matching import Scan, match_scans
+from processing.scan_matching import match_scans
+from processing.scan_walls import Scan
 from processing.strong_links import LOOP_SPACING_M, KeyFrames, hop_pairs, loop_pairs, worth_a_link
 
 Solved = tuple[Graph, list[SolvedPiece]]

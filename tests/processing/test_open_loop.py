@@ -14,7 +14,8 @@ from processing.pipeline import DrivenRun
 from processing.read_log import Run, read_log
 from processing.read_scans import Scans
 from processing.scan_match import ScanMatch
-from processing.scan_matching import Scan, match_scans
+from processing.scan_matching import match_scans
+from processing.scan_walls import Scan
 from processing.simulation.simulate import simulate
 from processing.sweeps import sweeps_of
 from processing.tum import read_tum

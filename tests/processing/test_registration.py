@@ -11,7 +11,7 @@ from processing.open_loop import mount_pose
 from processing.pieces import split_drifts
 from processing.pipeline import DrivenRun, piece_input
 from processing.registration import lies_along, pass_hypotheses, path_starts, register_passes
-from processing.scan_matching import Scan, prepare_scan
+from processing.scan_walls import Scan, prepare_scan
 
 STRAIGHT = np.column_stack([np.arange(0, 80, 0.75), np.zeros(107), np.zeros(107)])
 

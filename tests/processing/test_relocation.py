@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose
 
 from processing.geometry import compose, wrap_angle
 from processing.relocation import likelihood_field, relocate, relocate_stretch
-from processing.scan_matching import match_scans, prepare_scan
+from processing.scan_matching import match_scans
+from processing.scan_walls import prepare_scan
 from processing.simulation.raycast import build_grid, cast
 from processing.strong_links import KeyFrames
 

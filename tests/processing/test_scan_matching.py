@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 from processing.geometry import compose, inverse, rotation, wrap_angle
 from processing.match_search import score, search_match
 from processing.scan_match import ScanMatch
-from processing.scan_matching import UNSEEN_VARIANCE, Scan, match_scans, prepare_scan
+from processing.scan_matching import UNSEEN_VARIANCE, match_scans
+from processing.scan_walls import Scan, prepare_scan
 from processing.simulation.raycast import SegmentGrid, build_grid, cast
 from processing.simulation.walls import periodic_noise
 
@@ -144,7 +145,9 @@ def test_a_smooth_drift_leaves_the_motion_along_it_to_the_guess(error_m: float) 
     assert np.abs(np.array(errors)[:, 2]).max() < 0.001
 
 
-@pytest.mark.parametrize(("roughness_m", "least_m", "most_m"), [(0.01, 10, 1000), (0.04, 0, 1000), (0.1, 0, 0.03)])
+@pytest.mark.parametrize(
+    ("roughness_m", "least_m", "most_m"), [(0.0, 10, 1000), (0.01, 0.1, 1000), (0.04, 0, 0.2), (0.1, 0, 0.03)]
+)
 def test_between_smooth_and_rough_the_covariance_says_which(roughness_m: float, least_m: float, most_m: float) -> None:
     """What the match claims to see of the motion along the drift, it sees."""
     start, motion, along = np.array([0.0, 0.2, 0.0]), np.array([0.5, 0.03, 0.04]), np.array([1.0, 0.0])
@@ -274,6 +277,16 @@ def test_normals_face_the_scanner_and_stand_on_the_wall() -> None:
     in_world = scan.normals[fitted] @ rotation(0.2).T
     assert_allclose(np.abs(in_world), np.tile([0, 1], (fitted.sum(), 1)), atol=1e-6)
     assert np.all(np.isnan(scan.normals[~np.isfinite(scan.points[:, 0])]))
+
+
+def test_a_smooth_wall_is_known_to_its_very_ends() -> None:
+    """Where the field of view cuts a wall off, many points of a scan that looks further hang on its last normals."""
+    angles = []
+    for seed in range(20):
+        scan = look(drift(0.0), np.zeros(3), np.random.default_rng(seed))
+        ends = np.flatnonzero(np.isfinite(scan.normals[:, 0]))[[0, 1, 2, -3, -2, -1]]
+        angles.append(np.abs(np.arctan(scan.normals[ends, 0] / scan.normals[ends, 1])))
+    assert np.sqrt(np.mean(np.square(angles))) < 0.006  # over WALL_LENGTH_M it is 0.03
 
 
 def test_no_wall_is_drawn_across_an_edge() -> None:

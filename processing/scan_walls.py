@@ -1,0 +1,146 @@
+"""The walls of a scan: the line through each of its points, as the matching of scans wants them.
+
+In: points in the scanner's frame, by ascending bearing. Out: a `Scan`: at each point the normal of the wall, and how
+sure point and normal are. A rough wall is known from the few points around; a smooth one from two metres of it, so that
+its direction is known to a milliradian: how else would a match know along which way it sees nothing?
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RANGE_NOISE_M = 0.012  # statistical error of an LMS111, data sheet
+WALL_LENGTH_M = 0.35  # a normal is fitted to at least this much wall, where there are enough points
+MAX_NEIGHBOURS = 12
+SMOOTH_M = 2.0  # a wall this far straight, to as much as noise lets one see, is smooth
+CHANCE = 2.0  # standard deviations by which its residuals may exceed the noise
+GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ see no wall, or see it at less than 10°
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """A scan ready for matching, in its own frame: x ahead of the scanner, y left; B beams by ascending bearing."""
+
+    points: Array  # (B, 2) m; without a return: NaN
+    normals: Array  # (B, 2) towards the scanner; NaN where no wall could be fitted
+    variances: Array  # (B, 2): of the point off its line [m²], of the normal's direction [rad²]
+    angle_min: float
+    angle_increment: float
+    bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
+
+
+@njit(cache=True)
+def _stretches(points: Array, joined: NDArray[np.bool_]) -> tuple[Array, Ints]:
+    """Sums (B + 1, 5) of x, y, x², xy, y² over all points before each; and for each point the first and the last (B, 2)
+    of those in a row with it that lie within SMOOTH_M.
+    """
+    count = points.shape[0]
+    sums, ends = np.zeros((count + 1, 5)), np.zeros((count, 2), np.int64)
+    first = last = 0
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        for k, value in enumerate((x, y, x * x, x * y, y * y)):
+            sums[i + 1, k] = sums[i, k] + (value if math.isfinite(x) else 0.0)
+        if i > 0 and not joined[i - 1]:
+            first = i
+        while first < i and (points[first, 0] - x) ** 2 + (points[first, 1] - y) ** 2 > SMOOTH_M * SMOOTH_M:
+            first += 1
+        last = max(last, i)
+        while joined[last] and (points[last + 1, 0] - x) ** 2 + (points[last + 1, 1] - y) ** 2 <= SMOOTH_M * SMOOTH_M:
+            last += 1
+        ends[i, 0], ends[i, 1] = first, last
+    return sums, ends
+
+
+@njit(cache=True)
+def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array, variances: Array) -> float:
+    """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are.
+
+    Returns: how far off its beam's bearing a point lies at most [rad].
+    """
+    count, bent = points.shape[0], 0.0
+    for i in range(count):
+        if math.isfinite(points[i, 0]):
+            off = math.atan2(points[i, 1], points[i, 0]) - (angle_min + i * increment)
+            bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
+    joined = np.zeros(count, np.bool_)  # with the next beam: do the two see one wall?
+    for i in range(count - 1):
+        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        reach = math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+        joined[i] = math.sqrt(dx * dx + dy * dy) < max(0.15, GRAZING * increment * reach)  # NaN compares false
+    sums, ends = _stretches(points, joined)
+    for i in range(count):
+        normals[i, 0] = normals[i, 1] = np.nan
+        variances[i, 0] = variances[i, 1] = np.nan
+        if i == 0 or i == count - 1 or not (joined[i - 1] and joined[i]):
+            continue
+        # Grow to both sides, a beam at a time; the moments are those about point i.
+        x0, y0 = points[i, 0], points[i, 1]
+        low = high = i
+        grow_low = grow_high = True
+        sx = sy = sxx = sxy = syy = 0.0
+        while (grow_low or grow_high) and high - low < 2 * MAX_NEIGHBOURS:
+            if grow_low:
+                grow_low = low > 0 and joined[low - 1] and i - low < MAX_NEIGHBOURS
+                if grow_low:
+                    low -= 1
+                    dx, dy = points[low, 0] - x0, points[low, 1] - y0
+                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+            if grow_high:
+                grow_high = high < count - 1 and joined[high] and high - i < MAX_NEIGHBOURS
+                if grow_high:
+                    high += 1
+                    dx, dy = points[high, 0] - x0, points[high, 1] - y0
+                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+            if high - low >= 4:
+                dx, dy = points[high, 0] - points[low, 0], points[high, 1] - points[low, 1]
+                if dx * dx + dy * dy > WALL_LENGTH_M * WALL_LENGTH_M:
+                    break
+        n = high - low + 1
+        if n < 4:
+            continue
+        sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+        # A smooth wall is known better from a longer stretch of it: to both sides, or, at its ends, to one.
+        for a, b in ((ends[i, 0], ends[i, 1]), (ends[i, 0], i + 1), (i - 1, ends[i, 1])):
+            dx, dy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+            m = b - a + 1
+            if m > n and dx * dx + dy * dy > SMOOTH_M * SMOOTH_M:
+                tx, ty = sums[b + 1, 0] - sums[a, 0], sums[b + 1, 1] - sums[a, 1]
+                txx = sums[b + 1, 2] - sums[a, 2] - tx * tx / m
+                txy = sums[b + 1, 3] - sums[a, 3] - tx * ty / m
+                tyy = sums[b + 1, 4] - sums[a, 4] - ty * ty / m
+                rest = 0.5 * (txx + tyy) - math.sqrt(0.25 * (txx - tyy) ** 2 + txy * txy)
+                if rest < RANGE_NOISE_M**2 * (m - 2 + CHANCE * math.sqrt(2.0 * (m - 2))):
+                    n, sxx, sxy, syy = m, txx, txy, tyy
+                    break
+        # The larger eigenvalue of the scatter, and its direction: the wall's.
+        half = 0.5 * (sxx - syy)
+        root = math.sqrt(half * half + sxy * sxy)
+        along = 0.5 * (sxx + syy) + root
+        across = max(sxx + syy - along, 0.0)
+        if along < 9 * across or along < 1e-6:
+            continue  # a blob, not a wall
+        wx, wy = (root + half, sxy) if half > 0 else (sxy, root - half)
+        length = math.sqrt(wx * wx + wy * wy)
+        nx, ny = -wy / length, wx / length
+        if nx * x0 + ny * y0 > 0:
+            nx, ny = -nx, -ny
+        noise = max(across / (n - 2), RANGE_NOISE_M * RANGE_NOISE_M)
+        normals[i, 0], normals[i, 1] = nx, ny
+        variances[i, 0] = noise
+        variances[i, 1] = noise / along
+    return bent
+
+
+def prepare_scan(points: Array, angle_min: float, angle_increment: float) -> Scan:
+    """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    normals, variances = np.empty_like(points), np.empty_like(points)
+    bent_rad = _fit_walls(points, angle_min, angle_increment, normals, variances)
+    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad)
