@@ -128,9 +128,9 @@ def _driven(vehicle: Vehicle, steps: Array, turns: Array) -> Array:
 
 
 def _steering(wheelbase_m: float, steps: Array, turns: Array) -> Array:
-    """(N,) the angle of the step that follows; it stays where it was while the vehicle stands."""
+    """(N,) the mean of the steps before and after; it stays where it was while the vehicle stands."""
     moving = np.abs(steps) > STANDING_M
     angles = np.where(moving, np.arctan(wheelbase_m * turns / np.where(moving, steps, 1.0)), 0.0)
     newest = np.maximum.accumulate(np.where(moving, np.arange(len(steps)), -1))
     held = np.where(newest >= 0, angles[newest], 0.0)
-    return np.append(held, held[-1:] if len(held) else 0.0)
+    return (np.append(held[:1], held) + np.append(held, held[-1:])) / 2
