@@ -105,12 +105,26 @@ def test_no_stream_fills_the_memory(dialect: Dialect, first: bytes, flood: bytes
         assert len(receiver._buffer) <= MAX_PAYLOAD_BYTES + 9
 
 
-@given(data=st.binary(max_size=400), dialect=st.sampled_from(DIALECTS))
-def test_arbitrary_bytes_raise_nothing(data: bytes, dialect: Dialect) -> None:
-    receiver = Receiver(dialect)
-    payloads = receiver.feed(data)
-    kept = len(data) - receiver.skipped_bytes - sum(len(frame(dialect, payload)) for payload in payloads if payload)
-    assert 0 <= kept <= len(data)
+hostile = st.lists(
+    st.binary(max_size=20)
+    | st.sampled_from(
+        [b"\x02", b"\x03", 4 * b"\x02", b"\x02s", 4 * b"\x02" + b"\0\0\0\x09sAN Run 1", b"\x02sAN Run 1\x03"]
+    )
+    | st.sampled_from(DIALECTS).map(lambda dialect: frame(dialect, b"sAN Run 1")),
+    max_size=30,
+).map(b"".join)
+
+
+@given(data=hostile, dialect=st.sampled_from(DIALECTS), piece=st.integers(1, 40))
+def test_of_any_bytes_the_same_is_found_however_they_are_cut_and_all_is_accounted_for(
+    data: bytes, dialect: Dialect, piece: int
+) -> None:
+    whole, pieces = Receiver(dialect), Receiver(dialect)
+    found = whole.feed(data)
+    assert [p for start in range(0, len(data), piece) for p in pieces.feed(data[start : start + piece])] == found
+    for receiver in (whole, pieces):
+        told = sum(len(frame(dialect, payload)) for payload in found) + receiver.skipped_bytes
+        assert told + len(receiver._buffer) == len(data)
 
 
 def test_commands() -> None:
