@@ -94,7 +94,7 @@ class SeiEncoders(Device[EncoderReading]):
         asked = [name for name in self._addresses if name not in self._silent]
         fixes = {name: self._ask(port, name, strobed_ns) for name in asked}
         again = [name for name, fix in fixes.items() if fix is None or not self._maker.is_possible(name, fix)]
-        if asked and not again:
+        if len(asked) == len(self._addresses) and not again:
             self._timing.add(planned_ns, time.monotonic_ns())
         self._tally["retries"] += len(again)
         for name in again:

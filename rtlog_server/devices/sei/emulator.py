@@ -125,10 +125,12 @@ class SeiBusEmulator:
             if not host_baud:
                 continue
             received += sent
-            arrived_ns = arriving_ns + protocol.wire_ns(len(sent), host_baud)
+            wire_ns = protocol.wire_ns(len(sent), host_baud)
             if self._echo:
-                self._write_at(sent, arrived_ns)
+                self._write_at(sent, arriving_ns + wire_ns)
             while (request := protocol.take_request(received)) is not None:
+                # requests that were read at once came one after the other all the same
+                arrived_ns = arriving_ns + wire_ns - protocol.wire_ns(len(received), host_baud)
                 for address in self._addressed(request.address, host_baud):
                     reply = self._answer(address, request, arrived_ns)
                     self._write_paced(reply, arrived_ns, host_baud)
