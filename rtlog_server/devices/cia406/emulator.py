@@ -136,7 +136,7 @@ class CanBusEmulator:
 
     def _send(self, frames: list[Frame]) -> None:
         for frame in frames:
-            if frame.can_id & (protocol.NODES - 1) not in self._muted:
+            if protocol.node_of(frame) not in self._muted:
                 try:
                     self._port.send(frame)
                 except DeviceError:  # nobody listens: a node does not care

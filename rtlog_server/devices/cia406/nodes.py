@@ -92,10 +92,12 @@ class Nodes:
 
     def take(self, frame: Frame, arrived_ns: int) -> Mapping[str, Fix] | None:
         """A frame from the bus; the positions of a round, if it was the last one missing."""
+        node = self._nodes.get(protocol.node_of(frame))
+        if node is None:
+            return None
         try:
             said = protocol.decode(frame)
-            node = self._nodes.get(said.node) if said is not None else None
-            if said is None or node is None:
+            if said is None:
                 return None
             node.heard_ns = arrived_ns
             if isinstance(said, Pdo):

@@ -117,9 +117,14 @@ def wire_ns(data_bytes: int, bitrate: int) -> int:
 # What nodes say
 
 
+def node_of(frame: Frame) -> int:
+    """The node that a frame comes from or goes to; 0: all of them."""
+    return frame.can_id & (NODES - 1)
+
+
 def decode(frame: Frame) -> Heartbeat | Emergency | Pdo | SdoReply | None:
     """What a node said; None: the frame is none of a node's. Raises: CanOpenError: its length is wrong."""
-    service, node = frame.can_id & ~(NODES - 1), frame.can_id & (NODES - 1)
+    service, node = frame.can_id & ~(NODES - 1), node_of(frame)
     if node == 0 or frame.can_id >= 1 << 11:
         return None
     if service == HEARTBEAT:

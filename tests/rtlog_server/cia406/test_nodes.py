@@ -68,6 +68,15 @@ def test_a_node_that_falls_silent_is_away_and_sought_from_time_to_time() -> None
     assert nodes.due(LOST_NS + SEEK_NS + 4) is left
 
 
+def test_only_what_the_encoders_send_is_counted_as_garbled() -> None:
+    nodes = running_nodes()
+    nodes.take(Frame(0x7FF, b""), 1)  # a heartbeat of node 127, too short
+    assert nodes.tally["garbled"] == 0
+    nodes.take(Frame(0x705, b""), 1)
+    assert nodes.tally["garbled"] == 1
+    assert nodes.last_garbled == "heartbeat of node 5 has 0 bytes, not 1"
+
+
 class Answering:
     """An SDO server that is an emulated encoder's until `spoilt` has something else to answer."""
 
