@@ -97,6 +97,15 @@ def read_document(path: Path) -> dict[str, Any]:
     return document
 
 
+def caveats(document: Mapping[str, Any]) -> list[str]:
+    """What the user should know about the map, a line each: what was left out and why, and other remarks."""
+    out = []
+    for item in document.get("left_out", []):
+        ticks = ", ".join(map(str, item["ticks"]))
+        out.append(f"{item['what']} is left out of run {item['run']}, ticks {ticks}: {item['reason']}")
+    return [*out, *document["remarks"]]
+
+
 def _overlay(atlas: Atlas) -> Overlay:
     at = np.array([[node["x"], node["y"]] for node in atlas.document["nodes"]]).reshape(-1, 2)
     ends = [[edge["i"], edge["j"]] for edge in atlas.document["edges"] if edge["j"] is not None]

@@ -1,4 +1,4 @@
-"""rtlog-atlas build | info | compare | simulate | import: the mapping commands. Only here is anything printed.
+"""rtlog-atlas build | info | report | compare | simulate | import: the mapping commands. Only here is anything printed.
 
 What a verb needs is imported in the verb, so that `--help` does not wait for compilers and solvers to load.
 """
@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.errors import BadInputError
@@ -37,6 +36,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb = add_verb(verbs, "info", _info, "say what is in an atlas", "rtlog-atlas info level.atlas")
     verb.add_argument("atlas", type=Path, metavar="NAME.atlas")
     verb.add_argument("--json", action="store_true", help="all of atlas.json")
+
+    example = "rtlog-atlas report level.atlas -o level.html"
+    verb = add_verb(verbs, "report", _report, "show an atlas and what it rests on, as one page", example)
+    verb.add_argument("atlas", type=Path, metavar="NAME.atlas")
+    verb.add_argument("-o", "--output", type=Path, metavar="PAGE.html", help="default: NAME.report.html beside it")
 
     example = "rtlog-atlas compare level.atlas --truth simulated/level"
     verb = add_verb(verbs, "compare", _compare, "measure an atlas against the truth or known relations", example)
@@ -76,7 +80,7 @@ def _jobs(text: str) -> int:
 
 def _build(args: argparse.Namespace) -> None:
     from hw_profiles.profile import load_profile
-    from processing.atlas import refuse_existing, write_atlas
+    from processing.atlas import caveats, refuse_existing, write_atlas
     from processing.pipeline import Config, build
 
     refuse_existing(args.output)
@@ -85,7 +89,7 @@ def _build(args: argparse.Namespace) -> None:
     atlas = build(args.recordings, profile, Config(args.method, args.assembly, args.matcher), args.jobs)
     write_atlas(args.output, atlas)
     document = atlas.document
-    for line in [*map(_left_out, document["left_out"]), *document["remarks"]]:
+    for line in caveats(document):
         print(f"rtlog-atlas: {line}", file=sys.stderr)
     summary = {
         "atlas": str(args.output),
@@ -103,7 +107,7 @@ def _build(args: argparse.Namespace) -> None:
 
 
 def _info(args: argparse.Namespace) -> None:
-    from processing.atlas import read_document
+    from processing.atlas import caveats, read_document
 
     document = read_document(args.atlas)
     if args.json:
@@ -121,13 +125,16 @@ def _info(args: argparse.Namespace) -> None:
         print(
             f"{edge['kind']:5} {edge['id']}: {len(edge['paths'])} paths{length}, {edge['links']['strong']} strong links"
         )
-    for line in [*map(_left_out, document.get("left_out", [])), *document["remarks"]]:
+    for line in caveats(document):
         print(f"note  {line}")
 
 
-def _left_out(item: dict[str, Any]) -> str:
-    ticks = ", ".join(map(str, item["ticks"]))
-    return f"{item['what']} is left out of run {item['run']}, ticks {ticks}: {item['reason']}"
+def _report(args: argparse.Namespace) -> None:
+    from processing.report.page import write_report
+
+    output = args.output or args.atlas.with_name(f"{args.atlas.resolve().stem}.report.html")
+    write_report(args.atlas, output)
+    print(f"{output}: open it in a browser")
 
 
 def _compare(args: argparse.Namespace) -> None:

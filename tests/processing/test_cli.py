@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 COMMAND = [sys.executable, "-m", "processing.cli"]
-VERBS = ["build", "info", "compare", "simulate", "import"]
+VERBS = ["build", "info", "report", "compare", "simulate", "import"]
 HEAVY = ("numba", "numpy", "PIL", "scipy", "shapely", "zenoh", "tqdm", "mcap")
 
 
