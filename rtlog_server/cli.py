@@ -9,8 +9,7 @@ from dataclasses import asdict
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.profile import load_profile, parse_profile, read_profile_text, shipped_profiles
-from rtlog_server.check import check_devices
-from rtlog_server.daemon import run
+from rtlog_server.realtime import become_realtime
 
 COLUMNS = ("device", "", "", "found", "what to do next")
 
@@ -46,10 +45,16 @@ def run_server(args: argparse.Namespace) -> None:
     level = logging.DEBUG if args.verbose else logging.INFO
     logging.basicConfig(stream=sys.stderr, level=level, format="%(asctime)s %(levelname)s %(message)s")
     text = read_profile_text(args.profile)
-    run(parse_profile(text, source=args.profile), text)
+    profile = parse_profile(text, source=args.profile)
+    realtime = become_realtime()
+    from rtlog_server.daemon import run  # only now: on a loaded board, real time halves what it takes to load
+
+    run(profile, text, realtime)
 
 
 def check(args: argparse.Namespace) -> int:
+    from rtlog_server.check import check_devices
+
     logging.basicConfig(level=logging.CRITICAL)  # the table says it all
     results = check_devices(load_profile(args.profile))
     rows = [(device, finding) for device, findings in results.items() for finding in findings]

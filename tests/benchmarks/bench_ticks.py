@@ -66,12 +66,12 @@ def load(folder: Path) -> Iterator[str]:
 
 
 @contextmanager
-def cyclictest(folder: Path, seconds: float) -> Iterator[Path | None]:
-    """cyclictest for so long; where its histogram will be, None without cyclictest."""
-    if shutil.which("cyclictest") is None:
-        yield None
-        return
+def cyclictest(folder: Path, seconds: float) -> Iterator[Path]:
+    """cyclictest for so long, where there is one; where its histogram will be, if it may run."""
     result = folder / "cyclictest.json"
+    if shutil.which("cyclictest") is None:
+        yield result
+        return
     command = ["cyclictest", "--mlockall", f"--priority={PRIORITY}", f"--interval={CYCLE_US}", "--default-system"]
     command += ["--quiet", f"--histogram={LONGEST_US}", f"--duration={seconds:.0f}", f"--json={result}"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -98,7 +98,7 @@ def measure(folder: Path, seconds: float) -> tuple[list[Any], dict[str, Any], ND
             time.sleep(seconds)
         status = ask_status(session)
     ticks = [decode(payload, "rtlog_msgs/msg/Tick") for payload in payloads]
-    return ticks, status, None if result is None else read_histogram(result), what
+    return ticks, status, read_histogram(result) if result.exists() else None, what
 
 
 def main() -> int:

@@ -120,6 +120,7 @@ def test_nobody_is_looked_for(server: Any) -> None:
 def test_zenoh_and_sampling_are_two_processes(server: Any) -> None:
     assert "zenoh" not in Path(f"/proc/{server.process.pid}/maps").read_text()
     assert "zenoh" in Path(f"/proc/{server.publisher_id()}/maps").read_text()
+    assert os.sched_getscheduler(server.publisher_id()) == os.SCHED_OTHER  # real time is for the sampling alone
 
 
 def test_a_tick_that_was_missed_comes_late_and_says_so(start_server: StartServer) -> None:
