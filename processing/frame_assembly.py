@@ -16,12 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU, splu
 
 from processing.geometry import compose, inverse, relative, relative_jacobians, wrap_angle
-from processing.pose_graph import CORNER, Links, boundary_information, factorise, residuals, robust_weights
+from processing.pose_graph import CORNER, Links, boundary_information, residuals, robust_weights
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+GRADUAL = (1e4, 1e3, 1e2, CORNER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +37,11 @@ class Condensed:
     root: Array  # (3b - 3, 3b - 3) R: |R · error|² is the cost of the errors of poses 1 … b-1 seen from pose 0
 
 
+def factorise(matrix: sp.csc_matrix) -> SuperLU:
+    """Sparse factors of a symmetric positive definite matrix."""
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
 def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variables: Ints) -> Condensed:
     """Eliminate all poses (N, 3) of a solved piece but the boundary's."""
     local = poses[boundary]
@@ -40,10 +49,10 @@ def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variabl
         return Condensed(variables, local, np.zeros((0, 0)))
     information = boundary_information(poses, links, weights, boundary)[3:, 3:]  # with the first pose held
     _, j_b = relative_jacobians(np.broadcast_to(local[0], local[1:].shape), local[1:])
-    turn = sp.block_diag(np.linalg.inv(j_b)).toarray()
-    seen = turn.T @ information @ turn
-    values, vectors = np.linalg.eigh((seen + seen.T) / 2)
-    return Condensed(variables, local, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+    turn = np.linalg.inv(j_b)  # blocks on a diagonal
+    blocks = information.reshape(len(turn), 3, len(turn), 3)
+    seen = np.einsum("iba,ibjc,jcd->iajd", turn, blocks, turn, optimize=True).reshape(information.shape)
+    return Condensed(variables, local, np.linalg.cholesky((seen + seen.T) / 2).T)
 
 
 def solve_frames(
@@ -51,20 +60,35 @@ def solve_frames(
 ) -> tuple[Array, Array]:
     """Poses (V, 3) of all variables, and the weight (m,) of each link between pieces. Damped Gauss–Newton.
 
-    `fixed` (V,): one variable of each connected part, at least.
+    With falling corners (graduated non-convexity): a loop that comes back a metre off is closed by its links, which
+    agree, before any of them is doubted. `fixed` (V,): one variable of each connected part, at least.
     """
+    poses = first_guess
+    for corner in GRADUAL:
+        poses = _minimise(poses, pieces, links, fixed, corner, max_iterations)
+    return poses, robust_weights(_squares(poses, links), links.robust, CORNER)
+
+
+def _minimise(
+    first_guess: Array,
+    pieces: list[Condensed],
+    links: Links,
+    fixed: NDArray[np.bool_],
+    corner: float,
+    max_iterations: int,
+) -> Array:
     poses = first_guess.copy()
     free = np.flatnonzero(np.repeat(~fixed, 3))
-    cost, damping = _cost(poses, pieces, links), 0.0
+    cost, damping = _cost(poses, pieces, links, corner), 0.0
     for _ in range(max_iterations if len(free) else 0):
-        jacobian, error = _linearise(poses, pieces, links)
+        jacobian, error = _linearise(poses, pieces, links, corner)
         jacobian = jacobian[:, free]
         normal = (jacobian.T @ jacobian).tocsc()
         normal = normal + damping * sp.diags(normal.diagonal()).tocsc()
         tried = poses.copy()
         tried.reshape(-1)[free] -= factorise(normal.tocsc()).solve(jacobian.T @ error)
         tried[:, 2] = wrap_angle(tried[:, 2])
-        tried_cost = _cost(tried, pieces, links)
+        tried_cost = _cost(tried, pieces, links, corner)
         if tried_cost <= cost * (1 + 1e-9) + 1e-12:
             settled = np.abs(relative(poses, tried)).max() < 1e-6
             poses, cost, damping = tried, tried_cost, damping / 10
@@ -74,7 +98,7 @@ def solve_frames(
             damping = max(10 * damping, 1e-6)
             if damping > 1e6:
                 break
-    return poses, robust_weights(_squares(poses, links), links.robust, CORNER)
+    return poses
 
 
 def _squares(poses: Array, links: Links) -> Array:
@@ -89,15 +113,15 @@ def _piece_error(poses: Array, piece: Condensed) -> Array:
     return np.asarray(piece.root @ error.ravel())
 
 
-def _cost(poses: Array, pieces: list[Condensed], links: Links) -> float:
+def _cost(poses: Array, pieces: list[Condensed], links: Links, corner: float) -> float:
     squares = _squares(poses, links)
-    robust = np.where(links.robust, CORNER * squares / (CORNER + squares), squares).sum()
+    robust = np.where(links.robust, corner * squares / (corner + squares), squares).sum()
     return float(
         robust + sum(np.square(_piece_error(poses, piece)).sum() for piece in pieces if len(piece.variables) > 1)
     )
 
 
-def _linearise(poses: Array, pieces: list[Condensed], links: Links) -> tuple[sp.csc_matrix, Array]:
+def _linearise(poses: Array, pieces: list[Condensed], links: Links, corner: float) -> tuple[sp.csc_matrix, Array]:
     """The whitened errors and their sparse Jacobian over all variables."""
     rows, columns, values, errors, height = [], [], [], [], 0
 
@@ -118,7 +142,7 @@ def _linearise(poses: Array, pieces: list[Condensed], links: Links) -> tuple[sp.
         errors.append(_piece_error(poses, piece))
         height += len(errors[-1])
     if len(links):
-        weights = robust_weights(_squares(poses, links), links.robust, CORNER)
+        weights = robust_weights(_squares(poses, links), links.robust, corner)
         roots = np.sqrt(weights)[:, None, None] * np.swapaxes(np.linalg.cholesky(links.informations), 1, 2)
         j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
         error = residuals(poses, links)

@@ -7,13 +7,14 @@ The cost of a link is the square of its Mahalanobis distance d up to a corner, a
 which every cost is the limit: weight (c / (c + d²))²). Weak links, the chain of the drive itself, are never doubted.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU, splu
 
+from processing.block_cholesky import Pattern, factorise, find_pattern, inverse_blocks, solve_factors, whiten
 from processing.geometry import relative, relative_jacobians, wrap_angle
 
 Array = NDArray[np.float64]
@@ -87,47 +88,73 @@ def robust_weights(squares: Array, robust: NDArray[np.bool_], corner: float) -> 
     return np.where(robust, (corner / (corner + squares)) ** 2, 1.0)
 
 
+@dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """The sparse structure of the links, laid out once: filling in numbers is then one scatter."""
+    """Of the free poses, in the places of a pattern."""
 
-    def __init__(self, poses: int, ends: Ints, fixed: NDArray[np.bool_]) -> None:
-        self.free = np.flatnonzero(~fixed)
-        self.count = len(self.free)
-        position = np.full(poses, -1, np.int64)
-        position[self.free] = np.arange(self.count)
-        a, b = position[ends[:, 0]], position[ends[:, 1]]
-        # Four 3 × 3 blocks a link: (a, a), (a, b), (b, a), (b, b).
-        rows, columns = np.stack([a, a, b, b], axis=1), np.stack([a, b, a, b], axis=1)
-        self.used = (rows >= 0) & (columns >= 0)
-        offset = np.arange(3)
-        shape = (*rows.shape, 3, 3)
-        r = np.broadcast_to((3 * rows)[..., None, None] + offset[:, None], shape)[self.used].ravel()
-        c = np.broadcast_to((3 * columns)[..., None, None] + offset[None, :], shape)[self.used].ravel()
-        size = 3 * self.count
-        key, self.slot = np.unique(c * size + r, return_inverse=True)
-        self.rows = (key % size).astype(np.int32)
-        self.pointers = np.searchsorted(key // size, np.arange(size + 1)).astype(np.int32)
-        self.ends_ab = np.stack([a, b], axis=1)
-
-    def matrix(self, j_a: Array, j_b: Array, informations: Array) -> sp.csc_matrix:
-        ia, ib = informations @ j_a, informations @ j_b
-        ta, tb = np.swapaxes(j_a, 1, 2), np.swapaxes(j_b, 1, 2)
-        blocks = np.stack([ta @ ia, ta @ ib, tb @ ia, tb @ ib], axis=1)
-        data = np.bincount(self.slot, weights=blocks[self.used].ravel(), minlength=len(self.rows))
-        size = 3 * self.count
-        return sp.csc_matrix((data, self.rows, self.pointers), shape=(size, size))
-
-    def gradient(self, j_a: Array, j_b: Array, informations: Array, error: Array) -> Array:
-        weighted = np.einsum("mij,mj->mi", informations, error)
-        out = np.zeros((self.count + 1, 3))  # the last row takes what belongs to fixed poses
-        np.add.at(out, self.ends_ab[:, 0], np.einsum("mji,mj->mi", j_a, weighted))
-        np.add.at(out, self.ends_ab[:, 1], np.einsum("mji,mj->mi", j_b, weighted))
-        return out[:-1].ravel()
+    diagonal: Array  # (n, 3, 3)
+    below: Array  # (e, 3, 3)
+    gradient: Array  # (n, 3)
 
 
-def factorise(matrix: sp.csc_matrix) -> SuperLU:
-    """Sparse factors of a symmetric positive definite matrix."""
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+def normal_equations(poses: Array, links: Links, weights: Array, pattern: Pattern, slots: Ints) -> NormalEquations:
+    """Linearised at `poses` (N, 3); `slots` (m,) are those of the links in the pattern."""
+    count = len(pattern)
+    out = NormalEquations(np.zeros((count, 3, 3)), np.zeros((len(pattern.rows), 3, 3)), np.zeros((count, 3)))
+    _assemble(
+        poses,
+        links.ends,
+        links.motions,
+        links.informations,
+        weights,
+        pattern.place,
+        slots,
+        out.diagonal,
+        out.below,
+        out.gradient,
+    )
+    return out
+
+
+@njit(cache=True)
+def _assemble(
+    poses: Array,
+    ends: Ints,
+    motions: Array,
+    informations: Array,
+    weights: Array,
+    place: Ints,
+    slots: Ints,
+    diagonal: Array,
+    below: Array,
+    gradient: Array,
+) -> None:
+    j_a, j_b, error = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    j_a[2, 2], j_b[2, 2] = -1.0, 1.0
+    for k in range(len(ends)):
+        a, b = ends[k]
+        p, q = place[a], place[b]
+        if p < 0 and q < 0:
+            continue
+        c, s = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+        dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+        x, y = c * dx + s * dy, -s * dx + c * dy
+        turn = poses[b, 2] - poses[a, 2] - motions[k, 2]
+        error[0], error[1] = x - motions[k, 0], y - motions[k, 1]
+        error[2] = turn - 2 * math.pi * round(turn / (2 * math.pi))
+        j_b[0, 0], j_b[0, 1], j_b[1, 0], j_b[1, 1] = c, s, -s, c
+        j_a[0, 0], j_a[0, 1], j_a[1, 0], j_a[1, 1] = -c, -s, s, -c
+        j_a[0, 2], j_a[1, 2] = y, -x
+        information = weights[k] * informations[k]
+        i_a, i_b, pull = information @ j_a, information @ j_b, information @ error
+        if p >= 0:
+            diagonal[p] += j_a.T @ i_a
+            gradient[p] += j_a.T @ pull
+        if q >= 0:
+            diagonal[q] += j_b.T @ i_b
+            gradient[q] += j_b.T @ pull
+        if slots[k] >= 0:
+            below[slots[k]] += j_a.T @ i_b if p > q else j_b.T @ i_a
 
 
 def solve(
@@ -145,19 +172,20 @@ def solve(
     if fixed is None:
         fixed = np.zeros(len(poses), bool)
         fixed[0] = True
-    equations = NormalEquations(len(poses), links.ends, fixed)
+    pattern = find_pattern(len(poses), links.ends, fixed)
+    slots = pattern.slots(links.ends)
     squares = squared_distances(poses, links)
     cost = _cost(squares, links, corner)
-    converged, iteration = equations.count == 0, 0
+    converged, iteration = len(pattern) == 0, 0
     while not converged and iteration < max_iterations:
         iteration += 1
-        j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
-        weighted = links.informations * robust_weights(squares, links.robust, corner)[:, None, None]
-        gradient = equations.gradient(j_a, j_b, weighted, residuals(poses, links))
-        step = -factorise(equations.matrix(j_a, j_b, weighted)).solve(gradient).reshape(-1, 3)
+        equations = normal_equations(poses, links, robust_weights(squares, links.robust, corner), pattern, slots)
+        if not factorise(pattern, equations.diagonal, equations.below):
+            break
+        step = -solve_factors(pattern, equations.diagonal, equations.below, equations.gradient)
         for scale in (1.0, 0.5, 0.25, 0.125):
             tried = poses.copy()
-            tried[equations.free] += scale * step
+            tried[pattern.free] += scale * step
             tried[:, 2] = wrap_angle(tried[:, 2])
             tried_squares = squared_distances(tried, links)
             tried_cost = _cost(tried_squares, links, corner)
@@ -181,32 +209,49 @@ def boundary_information(poses: Array, links: Links, weights: Array, boundary: I
 
     Its null space is the freedom of the frame: only relative poses of the boundary are known.
     """
+    count = len(boundary)
+    place = np.full(len(poses), -1, np.int64)
+    place[boundary] = np.arange(count)
+    eliminated = place < 0
+    pattern = find_pattern(len(poses), links.ends, ~eliminated)
+    equations = normal_equations(poses, links, weights, pattern, pattern.slots(links.ends))
     j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
-    equations = NormalEquations(len(poses), links.ends, np.zeros(len(poses), bool))
-    full = equations.matrix(j_a, j_b, links.informations * weights[:, None, None])
-    keep = (3 * boundary[:, None] + np.arange(3)).ravel()
-    inner = np.setdiff1d(np.arange(full.shape[0]), keep)
-    if len(inner) == 0:
-        return np.asarray(full.toarray()[np.ix_(keep, keep)])
-    border = full[inner][:, keep].toarray()
-    eliminated = factorise(full[inner][:, inner].tocsc()).solve(border)
-    return np.asarray(full[keep][:, keep].toarray() - border.T @ eliminated)
+    weighted = links.informations * weights[:, None, None]
+    kept, border = np.zeros((count, count, 3, 3)), np.zeros((len(pattern), count, 3, 3))
+    for i, j_i, j, j_j in ((0, j_a, 0, j_a), (0, j_a, 1, j_b), (1, j_b, 0, j_a), (1, j_b, 1, j_b)):
+        row, column = links.ends[:, i], place[links.ends[:, j]]
+        blocks = np.swapaxes(j_i, 1, 2) @ weighted @ j_j
+        for matrix, at in ((kept, place[row]), (border, pattern.place[row])):
+            used = (at >= 0) & (column >= 0)
+            np.add.at(matrix, (at[used], column[used]), blocks[used])
+    information = kept.swapaxes(1, 2).reshape(3 * count, 3 * count)
+    if not len(pattern):
+        return information
+    if not factorise(pattern, equations.diagonal, equations.below):
+        raise np.linalg.LinAlgError("poses hang on nothing")
+    sides = border.swapaxes(1, 2).reshape(len(pattern), 3, 3 * count)
+    white = whiten(pattern, equations.diagonal, equations.below, sides).reshape(-1, 3 * count)
+    return np.asarray(information - white.T @ white)
 
 
-def marginal_covariances(poses: Array, links: Links, weights: Array) -> Array:
-    """The covariance (N, 3, 3) of every pose as seen from pose 0."""
-    j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
+def marginal_covariances(poses: Array, links: Links, weights: Array, shared: Array | None = None) -> Array:
+    """The covariance (N, 3, 3) of every pose as seen from pose 0.
+
+    `shared` (q, m, 3): errors that links have in common, each the change of all motions at one standard deviation.
+    """
     fixed = np.zeros(len(poses), bool)
     fixed[0] = True
     out = np.zeros((len(poses), 3, 3))
-    if len(poses) == 1:
-        return out
-    equations = NormalEquations(len(poses), links.ends, fixed)
-    factors = factorise(equations.matrix(j_a, j_b, links.informations * weights[:, None, None]))
-    for first in range(0, equations.count, 100):  # columns of the inverse, some at a time: it is dense
-        last = min(first + 100, equations.count)
-        unit = np.zeros((3 * equations.count, 3 * (last - first)))
-        unit[3 * first : 3 * last] = np.eye(3 * (last - first))
-        columns = factors.solve(unit)[3 * first : 3 * last].reshape(last - first, 3, last - first, 3)
-        out[1 + first : 1 + last] = columns[np.arange(last - first), :, np.arange(last - first), :]
+    pattern = find_pattern(len(poses), links.ends, fixed)
+    slots = pattern.slots(links.ends)
+    equations = normal_equations(poses, links, weights, pattern, slots)
+    if not factorise(pattern, equations.diagonal, equations.below):
+        raise np.linalg.LinAlgError("poses hang on nothing")
+    out[pattern.free] = inverse_blocks(pattern, equations.diagonal, equations.below)
+    predicted = relative(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
+    for change in shared if shared is not None else ():
+        changed = replace(links, motions=predicted - change)
+        gradient = normal_equations(poses, changed, weights, pattern, slots).gradient
+        moved = solve_factors(pattern, equations.diagonal, equations.below, gradient)
+        out[pattern.free] += moved[:, :, None] * moved[:, None, :]
     return out

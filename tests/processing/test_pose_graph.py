@@ -5,13 +5,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
+from processing.block_cholesky import Pattern, factorise, find_pattern, inverse_blocks, solve_factors
 from processing.geometry import accumulate, compose, relative, relative_jacobians, wrap_angle
 from processing.pose_graph import (
     CORNER,
     Links,
-    NormalEquations,
     boundary_information,
     marginal_covariances,
+    normal_equations,
     residuals,
     robust_weights,
     solve,
@@ -86,16 +87,15 @@ def test_the_gradient_is_that_of_the_robust_cost() -> None:
     poses = astray(poses, 0.05, 0.02)
     fixed = np.zeros(N, bool)
     fixed[[0, 7]] = True
-    equations = NormalEquations(N, links.ends, fixed)
-    weighted = links.informations * robust_weights(squared_distances(poses, links), links.robust, CORNER)[:, None, None]
-    jacobians = relative_jacobians(*poses[links.ends.T])
-    gradient = equations.gradient(*jacobians, weighted, residuals(poses, links))
+    pattern = find_pattern(N, links.ends, fixed)
+    weights = robust_weights(squared_distances(poses, links), links.robust, CORNER)
+    gradient = normal_equations(poses, links, weights, pattern, pattern.slots(links.ends)).gradient
     numeric = np.zeros((N, 3))
     for k, c in np.ndindex(N, 3):
         step = np.zeros((N, 3))
         step[k, c] = 1e-6
         numeric[k, c] = (robust_cost(poses + step, links, CORNER) - robust_cost(poses - step, links, CORNER)) / 4e-6
-    assert_allclose(gradient, numeric[~fixed].ravel(), rtol=1e-5, atol=1e-2)
+    assert_allclose(gradient, numeric[pattern.free], rtol=1e-5, atol=1e-2)
     assert np.abs(gradient).max() > 10
 
 
@@ -104,11 +104,48 @@ def test_normal_equations_equal_the_dense_ones() -> None:
     fixed = np.zeros(N, bool)
     fixed[[3, 4]] = True
     weights = np.random.default_rng(3).uniform(0, 1, len(links))
-    matrix = NormalEquations(N, links.ends, fixed).matrix(
-        *relative_jacobians(*poses[links.ends.T]), links.informations * weights[:, None, None]
+    pattern = find_pattern(N, links.ends, fixed)
+    equations = normal_equations(poses, links, weights, pattern, pattern.slots(links.ends))
+    free = (3 * pattern.free[:, None] + np.arange(3)).ravel()
+    expected = dense_hessian(poses, links, weights)[np.ix_(free, free)]
+    assert_allclose(dense_matrix(pattern, equations.diagonal, equations.below), expected, rtol=1e-9, atol=1e-9)
+
+
+def dense_matrix(pattern: Pattern, diagonal: np.ndarray, below: np.ndarray) -> np.ndarray:
+    count = len(pattern)
+    full = np.zeros((count, count, 3, 3))
+    full[np.arange(count), np.arange(count)] = diagonal
+    columns = np.repeat(np.arange(count), np.diff(pattern.first))
+    full[pattern.rows, columns] = below
+    full[columns, pattern.rows] = np.swapaxes(below, 1, 2)
+    return full.swapaxes(1, 2).reshape(3 * count, 3 * count)
+
+
+@pytest.mark.parametrize("fixed_poses", [[0], [3, 4], list(range(1, N)), list(range(2, N))])
+def test_the_sparse_factor_solves_as_a_dense_matrix_does(fixed_poses: list[int]) -> None:
+    poses, links = network(5, noise=1.0)
+    fixed = np.isin(np.arange(N), fixed_poses)
+    pattern = find_pattern(N, links.ends, fixed)
+    assert sorted(pattern.free) == np.flatnonzero(~fixed).tolist()
+    equations = normal_equations(poses, links, np.ones(len(links)), pattern, pattern.slots(links.ends))
+    full = dense_matrix(pattern, equations.diagonal, equations.below)
+    diagonal, below = equations.diagonal.copy(), equations.below.copy()
+    assert factorise(pattern, diagonal, below)
+    right = np.random.default_rng(6).normal(size=(len(pattern), 3))
+    assert_allclose(
+        solve_factors(pattern, diagonal, below, right).ravel(), np.linalg.solve(full, right.ravel()), rtol=1e-6
     )
-    free = np.repeat(~fixed, 3)
-    assert_allclose(matrix.toarray(), dense_hessian(poses, links, weights)[np.ix_(free, free)], rtol=1e-9, atol=1e-9)
+    inverse = np.linalg.inv(full).reshape(len(pattern), 3, len(pattern), 3)
+    blocks = inverse[np.arange(len(pattern)), :, np.arange(len(pattern))]
+    assert_allclose(inverse_blocks(pattern, diagonal, below), blocks, rtol=1e-6, atol=1e-12)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
+    poses, links = network(5, noise=1.0)
+    pattern = find_pattern(N, links.ends, np.zeros(N, bool))  # nothing holds the frame
+    equations = normal_equations(poses, links, np.ones(len(links)), pattern, pattern.slots(links.ends))
+    equations.diagonal[len(pattern) // 2] *= -1
+    assert not factorise(pattern, equations.diagonal, equations.below)
 
 
 def test_a_consistent_graph_is_solved_exactly() -> None:
