@@ -24,10 +24,12 @@ from rtlog_client.record import record
 from rtlog_client.recorder import DEFAULT_ENDPOINT, RecordConfig
 from rtlog_client.recover import recover
 from rtlog_client.replay import NO_FAULTS, serve_devices
+from rtlog_client.replay_capture import serve_capture
 from rtlog_client.replay_report import load_report
 from rtlog_client.republish import republish
 from rtlog_server.realtime import become_realtime
 
+DEVICE_HELP = "RUN is a captured byte stream of this scanner, as laser/primary; its very bytes are sent"
 RATE_HELP = "so many times as fast, or max: one recorded tick for each tick of the profile; default: 1"
 
 
@@ -56,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     example = "rtlog-client replay recordings/a.mcap --to devices --profile simulated"
     verb = add_verb(verbs, "replay", _replay, "play a recording to the device emulators or on zenoh", example)
-    verb.add_argument("recording", type=Path, metavar="RUN.mcap")
+    verb.add_argument("recording", type=Path, metavar="RUN")
     verb.add_argument("--to", choices=("zenoh", "devices"), required=True, help="publish it, or be its devices")
     verb.add_argument(
         "--profile", default="simulated", metavar="P", help="says at which addresses; default: %(default)s"
@@ -64,6 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("--start", type=_start, default=0.0, metavar="S", help="so long after the recording's start")
     verb.add_argument("--duration", type=_seconds, metavar="S", help="default: to the end")
     verb.add_argument("--rate", type=_rate, default=1.0, metavar="R", help=f"to devices: {RATE_HELP}")
+    verb.add_argument("--device", metavar="NAME", help=f"to devices: {DEVICE_HELP}")
     verb.add_argument("--faults", type=Path, metavar="FILE.toml", help="to devices: what goes wrong at the wire, when")
 
     example = "rtlog-client compare recordings/a.mcap recordings/a_again.mcap --replay replay.json"
@@ -163,10 +166,16 @@ def _replay(args: argparse.Namespace) -> None:
     stopping, part = _stop_on_signals(), {"start_s": args.start, "duration_s": args.duration}
     if args.to == "devices":
         become_realtime()  # before the emulators' threads: a device does not wait for this machine's other work
-        report = serve_devices(args.recording, profile, stopping, **part, rate=args.rate, faults=faults)
+        more = {"rate": args.rate, "faults": faults}
+        if args.device is not None:
+            if args.start or args.duration:
+                raise BadInputError("--start and --duration are for recordings; captured bytes are sent whole")
+            report = serve_capture(args.recording, profile, args.device, stopping, **more)
+        else:
+            report = serve_devices(args.recording, profile, stopping, **part, **more)
         print(report.to_json())
-    elif args.rate != 1.0 or args.faults is not None:
-        raise BadInputError("--rate and --faults are for --to devices")
+    elif args.rate != 1.0 or args.faults is not None or args.device is not None:
+        raise BadInputError("--rate, --faults and --device are for --to devices")
     else:
         print(json.dumps(asdict(republish(args.recording, profile, profile_toml, stopping, **part))))
 

@@ -12,13 +12,14 @@ from typing import Any
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile, parse_profile
+from rtlog_client.capture import capture_events, read_capture
 from rtlog_client.compare_encoders import compare_encoders
 from rtlog_client.compare_scans import compare_scans
 from rtlog_client.compare_tags import compare_tags
 from rtlog_client.difference import Causes, DeviceComparison, fault_causes, stall_causes
-from rtlog_client.drive_log import TOPICS, Span, read_span
+from rtlog_client.drive_log import TOPICS, Span, read_events, read_span
 from rtlog_client.encoder_track import read_encoder_track
-from rtlog_client.log_file import LogInfo, read_info
+from rtlog_client.log_file import read_info
 from rtlog_client.replay_report import ReplayReport
 from rtlog_client.stage import addressed_lasers
 from rtlog_client.ticks_out import TicksOut, read_ticks
@@ -70,23 +71,34 @@ class Comparison:
 
 def compare_recordings(went_in: Path, came_out: Path, report: ReplayReport | None = None) -> Comparison:
     """Raises: BadInputError: one of them is no recording, is empty, or has no profile where one is needed."""
-    info_in, info_out = read_info(went_in), read_info(came_out)
+    profile, ticks = _profile(came_out), read_ticks(came_out)
+    missing = int((~ticks.recorded).sum())
+    overruns = int((ticks.lateness_s * 1e9 >= ticks.period_ns).sum())
+    figures = came_out, int(ticks.recorded.sum()), missing, overruns
+    if report is not None and report.capture_of is not None:
+        return Comparison(*figures, [_compare_capture(went_in, came_out, profile, report, ticks)])
     whole = read_span(went_in, 0.0, None)
     if report is None:
         report = ReplayReport(0, whole.start_ns, whole.end_ns, 0, 0, 0)
     span = Span(report.start_ns, report.end_ns, whole.first_tick_ns)
-    profile = _profile(came_out, info_out)
-    ticks = read_ticks(came_out)
     causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
-    missing = int((~ticks.recorded).sum())
-    overruns = int((ticks.lateness_s * 1e9 >= ticks.period_ns).sum())
-    devices = list(_compare_devices((went_in, span), info_in, came_out, profile, report, ticks, causes))
-    return Comparison(came_out, int(ticks.recorded.sum()), missing, overruns, devices)
+    return Comparison(*figures, _compare_devices((went_in, span), came_out, profile, report, ticks, causes))
+
+
+def _compare_capture(
+    went_in: Path, came_out: Path, profile: Profile, report: ReplayReport, ticks: TicksOut
+) -> DeviceComparison:
+    device = report.capture_of or ""
+    if report.rate != 1.0:
+        raise BadInputError(f"{went_in}: sent at another rate than its device's clock tells: there is no time to go by")
+    causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
+    events = capture_events(read_capture(went_in), device)
+    turn_s = 1 / addressed_lasers(profile)[device].scan_frequency_hz
+    return compare_scans(device, events, came_out, report, ticks, causes, turn_s)
 
 
 def _compare_devices(
     went_in: tuple[Path, Span],
-    info_in: LogInfo,
     came_out: Path,
     profile: Profile,
     report: ReplayReport,
@@ -94,12 +106,13 @@ def _compare_devices(
     causes: Causes,
 ) -> list[DeviceComparison]:
     """Of each device that the profile has and the input tells of."""
-    there = info_in.message_counts
+    there = read_info(went_in[0]).message_counts
     devices = []
     for name, laser in addressed_lasers(profile).items():
         if any(there.get(topic) for topic in TOPICS[name]):
             turn_s = 1 / laser.scan_frequency_hz
-            devices.append(compare_scans(name, went_in, came_out, report, ticks, causes, turn_s))
+            events = read_events(went_in[0], [name], went_in[1])
+            devices.append(compare_scans(name, events, came_out, report, ticks, causes, turn_s))
     if profile.encoders and (there.get(JOINT_STATES.name) or there.get(ODOMETRY.name)):
         track = read_encoder_track(went_in[0], profile)
         devices.append(compare_encoders(track, profile.encoders, came_out, report, ticks, causes))
@@ -108,7 +121,8 @@ def _compare_devices(
     return devices
 
 
-def _profile(recording: Path, info: LogInfo) -> Profile:
+def _profile(recording: Path) -> Profile:
+    info = read_info(recording)
     if info.profile_toml is None:
         raise BadInputError(f"{recording}: no profile in it; a recording of our server is wanted here")
     return parse_profile(info.profile_toml, f"in {recording}")

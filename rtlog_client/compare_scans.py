@@ -11,7 +11,7 @@ fraction of a second at a time.
 import sys
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from rtlog_client.difference import (
     gap_causes,
     hole_causes,
 )
-from rtlog_client.drive_log import TOPICS, Span, read_events
+from rtlog_client.drive_log import TOPICS, Event
 from rtlog_client.log_file import LoggedMessage, read_messages
 from rtlog_client.replay_report import ReplayReport
 from rtlog_client.ticks_out import TicksOut
@@ -53,7 +53,7 @@ class _Scan:
 
 def compare_scans(
     device: str,
-    went_in: tuple[Path, Span],
+    went_in: Iterable[Event],
     came_out: Path,
     report: ReplayReport,
     ticks: TicksOut,
@@ -62,8 +62,8 @@ def compare_scans(
 ) -> DeviceComparison:
     """`turn_s` is one turn of the head of the scanner that measured them the second time."""
     result = DeviceComparison(device)
-    scans_in = _scans_in(device, *went_in, report)
-    matcher = _Matcher(scans_in)
+    numbered = enumerate(went_in)
+    matcher = _Matcher(_scan(number, report.host_ns(event.stamp_ns), event.content) for number, event in numbered)
     positions: list[int] = []
     sequences: list[int] = []
     extra: list[tuple[_Scan, int]] = []
@@ -83,7 +83,7 @@ def compare_scans(
     _judge_scans(result, matcher, complete_ns, report, ticks, causes)
     for scan, position in extra:
         if stamps_ns.size and stamps_ns[0] - STAMP_NS <= scan.stamp_ns <= stamps_ns[-1] + STAMP_NS:
-            cause = causes.of(device, scan.stamp_ns, ticks.at(position))
+            cause = causes.of(device, scan.stamp_ns, scan.stamp_ns, ticks.at(position))
             stamp_ns = report.recorded_ns(scan.stamp_ns)
             result.differences.append(Difference(device, "extra", ticks.index(position), stamp_ns, cause))
     return result
@@ -173,7 +173,7 @@ def _judge_scans(
                 what, detail = "stamp", f"{error_ns * 1e-6:+.2f} ms"
         if what:
             tick = int(expected[number])
-            cause = causes.of(result.device, stamp_ns, ticks.at(int(latest[number])))
+            cause = causes.of(result.device, stamp_ns, int(complete_ns[number]), ticks.at(int(latest[number])))
             recorded_ns = report.recorded_ns(stamp_ns)
             result.differences.append(Difference(result.device, what, ticks.index(tick), recorded_ns, cause, detail))
     result.differences.reverse()
@@ -186,11 +186,6 @@ def _judge_scans(
 def _same(a: _Scan, b: _Scan) -> bool:
     near = all(abs(x - y) <= ANGLE_RAD for x, y in zip(a.angles, b.angles, strict=True))
     return near and np.array_equal(a.distances, b.distances) and np.array_equal(a.intensities, b.intensities)
-
-
-def _scans_in(device: str, recording: Path, span: Span, report: ReplayReport) -> Iterator[_Scan]:
-    for number, event in enumerate(read_events(recording, [device], span)):
-        yield _scan(number, report.host_ns(event.stamp_ns), event.content)
 
 
 def _scan_out(message: LoggedMessage) -> _Scan:

@@ -22,7 +22,8 @@ from rtlog_client.ticks_out import TicksOut
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import TAGS
 
-STAMP_NS = 25_000_000  # tolerance: a reader's stamp is when its line came
+STAMP_NS = 25_000_000  # tolerance: a reader's stamp is when its line came; with short ticks less
+STAMP_TICKS = 0.4
 RSSI = 0.05
 
 Key = tuple[str, int]  # EPC, antenna
@@ -67,7 +68,7 @@ def compare_tags(
     found += [(ticks.at(k), "silent", "no message") for k in range(first, last + 1) if k not in present]
     for stamp_ns, what, detail in sorted(found):
         position = int(ticks.first_after(np.array([stamp_ns]))[0])
-        cause = causes.of("rfid", stamp_ns, ticks.at(position))
+        cause = causes.of("rfid", stamp_ns, stamp_ns, ticks.at(position))
         recorded_ns = report.recorded_ns(stamp_ns)
         result.differences.append(Difference("rfid", what, ticks.index(position), recorded_ns, cause, detail))
     return result
@@ -78,9 +79,10 @@ def _differences(
 ) -> Iterator[tuple[int, str, str]]:
     """Of one tag and antenna: stamp, what, detail. Counts in `result` what is the same."""
     epc_reads = deque(pending)
+    tolerance_ns = min(STAMP_NS, STAMP_TICKS * period_ns)
     for entry in entries:
         waiting = []
-        while epc_reads and epc_reads[0].stamp_ns <= entry.stamp_ns + STAMP_NS:
+        while epc_reads and epc_reads[0].stamp_ns <= entry.stamp_ns + tolerance_ns:
             waiting.append(epc_reads.popleft())
         room = entry.count
         taken: list[_Read] = []
@@ -96,7 +98,7 @@ def _differences(
         for read in taken:
             late_ns = entry.stamp_ns - read.stamp_ns
             newest = read is taken[0]
-            if late_ns > STAMP_NS + (0 if newest else period_ns):
+            if late_ns > tolerance_ns + (0 if newest else period_ns):
                 yield read.stamp_ns, "late", f"{late_ns * 1e-6:.0f} ms"
             elif newest and not (abs(read.rssi - entry.rssi) <= RSSI or read.rssi != read.rssi):
                 yield read.stamp_ns, "changed", f"RSSI {read.rssi:g}, now {entry.rssi:g}"

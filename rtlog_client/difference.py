@@ -16,6 +16,7 @@ from rtlog_client.ticks_out import TicksOut
 
 RECOVERY_NS = 2_000_000_000  # within which a device is to be back after its fault
 TRANSIT_NS = 5_000_000  # from a sample's completion to the server's hand; later than this is late
+STALE_NS = 30_000_000  # before its tick, within which the samples of it are on their way
 STILL_NS = 2_000_000  # a tick that began so late tells of a machine that stood still
 UNEXPLAINED = ""
 BEFORE = "before recording began"
@@ -34,12 +35,16 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Why samples of a device may be missing or wrong; UTC of the host."""
+    """Why samples of a device may be missing or wrong; UTC of the host.
+
+    A `brief` one tells only of a sample that was due to arrive within it, not of one that was then being measured.
+    """
 
     text: str
     devices: tuple[str, ...]  # empty: all
     from_ns: int
     to_ns: int
+    brief: bool = False
 
 
 @dataclass(slots=True)
@@ -72,14 +77,15 @@ class Causes:
     def also(self, causes: Sequence[Cause]) -> "Causes":
         return Causes([*causes, *self._causes], self._ticks)
 
-    def of(self, device: str, from_ns: int, to_ns: int) -> str:
-        """Of what should have happened from `from_ns` to `to_ns`."""
+    def of(self, device: str, from_ns: int, due_ns: int, to_ns: int) -> str:
+        """Of a sample that was measured at `from_ns`, due to arrive at `due_ns` and belongs to the tick at `to_ns`."""
         if to_ns <= self._ticks.first_ns - self._ticks.period_ns:
             return BEFORE
-        if from_ns > self._ticks.last_ns or to_ns > self._ticks.last_ns:
+        if to_ns > self._ticks.last_ns:
             return AFTER
         for cause in self._causes:
-            if (not cause.devices or device in cause.devices) and cause.from_ns <= to_ns and from_ns <= cause.to_ns:
+            begin_ns, end_ns = (due_ns, due_ns) if cause.brief else (from_ns, to_ns)
+            if (not cause.devices or device in cause.devices) and cause.from_ns <= end_ns and begin_ns <= cause.to_ns:
                 return cause.text
         return UNEXPLAINED
 
@@ -99,12 +105,14 @@ def fault_causes(report: ReplayReport) -> list[Cause]:
 def stall_causes(report: ReplayReport, ticks: TicksOut) -> list[Cause]:
     """When the replaying process or the server's tick loop stood still."""
     replaying = [
-        Cause("the replaying machine stood still", (), stall.from_ns - TRANSIT_NS, stall.to_ns + TRANSIT_NS)
+        Cause("the replaying machine stood still", (), stall.from_ns - TRANSIT_NS, stall.to_ns + TRANSIT_NS, True)
         for stall in report.stalls
     ]
     late = np.flatnonzero(ticks.lateness_s * 1e9 > STILL_NS)
     return replaying + [
-        Cause("the server stood still", (), ticks.at(k) - TRANSIT_NS, ticks.at(k) + round(ticks.lateness_s[k] * 1e9))
+        Cause(
+            "the server stood still", (), ticks.at(k) - STALE_NS, ticks.at(k) + round(ticks.lateness_s[k] * 1e9), True
+        )
         for k in late.tolist()
     ]
 

@@ -50,9 +50,10 @@ class ReplayReport:
     scans: int
     unheard_scans: int  # of these, sent while no server listened
     tag_reads: int
-    rate: float = 1.0  # how much faster than it was recorded
+    rate: float = 1.0  # how much faster than it was recorded; 0: captured bytes as fast as they went
     faults: list[PlayedFault] = field(default_factory=list)
     stalls: list[Stall] = field(default_factory=list)
+    capture_of: str | None = None  # the device whose captured bytes were sent; times are since its first scan
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))

@@ -62,18 +62,22 @@ class Stage:
         angle: what an encoder shows at a time; called in the emulators' threads.
         faulty: the devices that get a wire.
         seed: of the wires' noise.
+        dialect: what the scanners speak, "A" or "B".
 
     Raises:
         BadInputError: no device of the profile has an address.
         RTLogError: an address is taken.
     """
 
-    def __init__(self, profile: Profile, angle: Angle, faulty: Collection[str] = (), seed: int = 0) -> None:
+    def __init__(
+        self, profile: Profile, angle: Angle, faulty: Collection[str] = (), seed: int = 0, dialect: str = "B"
+    ) -> None:
         self.lasers: dict[str, Lms111Emulator] = {}
         self.reader: Alr9650Emulator | None = None
         self.lines: dict[str, Line] = {}
         self._faulty = faulty
         self._seed = seed
+        self._dialect = dialect
         if not addressed_devices(profile):
             raise BadInputError(f"profile {profile.name} gives no device an address: there is nothing to emulate")
         with ExitStack() as stack:
@@ -97,7 +101,8 @@ class Stage:
 
     def _open_laser(self, name: str, laser: LaserDevice) -> None:
         faulty = name in self._faulty
-        emulator = Lms111Emulator() if faulty else Lms111Emulator(laser.host, laser.port)
+        address = (LOOPBACK, 0) if faulty else (laser.host, laser.port)
+        emulator = Lms111Emulator(*address, dialect=self._dialect)
         self.lasers[name] = self._stack.enter_context(emulator)
         if faulty:
             wire = TcpWire(name, (laser.host, laser.port), self._seed)

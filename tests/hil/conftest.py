@@ -68,6 +68,7 @@ class Drive:
     seconds: float
     scan_hz: int = 10
     lasers: tuple[Any, ...] = (PRIMARY_SCAN,)
+    gap: tuple[int, int] = (0, 0)  # ticks without scans, the last one excluded
 
     def write(self, path: Path) -> None:
         base = np.random.default_rng(1).integers(500, 15_000, BEAMS).astype(np.float32)
@@ -79,7 +80,7 @@ class Drive:
                     log.write(topic.name, topic.msgtype, encode(message), log_ns, stamp_ns)
 
     def _scans(self, k: int, tick_ns: int, base: Any) -> Iterator[tuple[Any, Any, int]]:
-        per_tick = self.scan_hz // 10
+        per_tick = 0 if self.gap[0] <= k < self.gap[1] else self.scan_hz // 10
         for part in range(per_tick):
             first_ns = tick_ns - BEFORE_TICK_NS - SWEEP_NS - (per_tick - 1 - part) * TURN_NS
             for number, topic in enumerate(self.lasers):
@@ -205,18 +206,21 @@ def free_ports(count: int) -> list[int]:
 class Rig:
     """A folder, a profile at addresses of its own, and the commands."""
 
-    def __init__(self, folder: Path, tick_period_s: float = 0.1, auxiliary: bool = False) -> None:
+    def __init__(self, folder: Path, tick_period_s: float = 0.1, auxiliary: bool = False, can: bool = False) -> None:
         self.folder = folder
         primary, second, rfid, zenoh = free_ports(4)
         self.endpoint = f"tcp/127.0.0.1:{zenoh}"
         self.profile = folder / "bench.toml"
         other = f'[lasers.auxiliary]\ndevice = {{ host = "127.0.0.1", port = {second} }}' if auxiliary else ""
+        bus = f'{{ kind = "sei", port = "{folder}/sei" }}'
+        if can:
+            bus = f'{{ kind = "can", interface = "udp_multicast", channel = "239.74.163.2", udp_port = {rfid} }}'
         self.profile.write_text(f"""
             schema = 1
             name = "bench"
             tick_period_s = {tick_period_s}
             vehicle = {{ kinematics = "differential", track_width_m = 1.6 }}
-            encoder_bus = {{ kind = "sei", port = "{folder}/sei" }}
+            encoder_bus = {bus}
             rfid = {{ model = "ALR-9650", device = {{ host = "127.0.0.1", port = {rfid} }} }}
             zenoh = {{ listen = ["{self.endpoint}"] }}
             [lasers.primary]
@@ -226,13 +230,13 @@ class Rig:
             name = "left_wheel"
             role = "left_wheel"
             wheel_radius_m = 0.35
-            address = 0
+            address = 5
             [[encoders]]
             name = "right_wheel"
             role = "right_wheel"
             wheel_radius_m = 0.35
             reversed = true
-            address = 1
+            address = 6
             """)
 
     @contextmanager
@@ -303,9 +307,9 @@ def make_rig(emulated: None, tmp_path: Path) -> Any:
 
 @pytest.fixture
 def make_drive(tmp_path: Path) -> Any:
-    def make(seconds: float, scan_hz: int = 10, lasers: tuple[Any, ...] = (PRIMARY_SCAN,)) -> Path:
+    def make(seconds: float, scan_hz: int = 10, lasers: Any = (PRIMARY_SCAN,), gap: tuple[int, int] = (0, 0)) -> Path:
         path = tmp_path / "drive.mcap"
-        Drive(seconds, scan_hz, lasers).write(path)
+        Drive(seconds, scan_hz, lasers, gap).write(path)
         return path
 
     return make
