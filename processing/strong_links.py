@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.geometry import compose, inverse, relative
+from processing.chain_step import to_laser, to_vehicle
+from processing.geometry import inverse, relative
 from processing.pose_graph import Links
-from processing.scan_match import ScanMatch, through_mount
+from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
 
@@ -100,8 +101,9 @@ def match_vehicles(
     match: Matcher,
 ) -> ScanMatch:
     """Match two scans; guess and result are motions of the vehicle."""
-    found = match(reference, current, compose(inverse(mount), compose(guess, mount)))
-    motion, covariance = through_mount(mount, found.motion, found.covariance)
+    from_laser = inverse(mount)
+    found = match(reference, current, to_laser(mount, from_laser, guess))
+    motion, covariance = to_vehicle(mount, from_laser, found.motion, found.covariance)
     return replace(found, motion=motion, covariance=covariance)
 
 

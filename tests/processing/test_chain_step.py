@@ -1,0 +1,59 @@
+"""The compiled step against the plain functions that it stands in for."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from processing.chain_step import carry, join, to_laser, to_vehicle, weigh
+from processing.fusion import consistent, fuse
+from processing.geometry import compose, compose_jacobians, inverse, wrap_angle
+from processing.odometry import Motions
+from processing.scan_match import through_mount
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(-3, 3, 3)
+
+
+def random_covariance(rng: np.random.Generator) -> np.ndarray:
+    root = rng.normal(size=(3, 3)) * [0.1, 0.05, 0.02]
+    return root @ root.T + 1e-6 * np.eye(3)
+
+
+@pytest.fixture(params=range(20))
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    return np.random.default_rng(request.param)
+
+
+def test_poses_and_their_covariances_are_carried_on(rng: np.random.Generator) -> None:
+    pose, step, covariance, noise = random_pose(rng), random_pose(rng), random_covariance(rng), random_covariance(rng)
+    j_pose, j_step = compose_jacobians(pose, step)
+    carried, grown = carry(pose, covariance, step, noise)
+    assert_allclose(carried, compose(pose, step), atol=1e-12)
+    assert_allclose(join(pose, step), compose(pose, step), atol=1e-12)
+    assert_allclose(grown, j_pose @ covariance @ j_pose.T + j_step @ noise @ j_step.T, atol=1e-12)
+
+
+def test_motions_pass_through_the_mount_both_ways(rng: np.random.Generator) -> None:
+    mount, motion, covariance = random_pose(rng), random_pose(rng), random_covariance(rng)
+    expected, spread = through_mount(mount, motion, covariance)
+    moved, grown = to_vehicle(mount, inverse(mount), motion, covariance)
+    assert_allclose(moved[:2], expected[:2], atol=1e-12)
+    assert_allclose(wrap_angle(moved[2] - expected[2]), 0, atol=1e-12)
+    assert_allclose(grown, spread, atol=1e-12)
+    back = to_laser(mount, inverse(mount), moved)
+    assert_allclose(back[:2], motion[:2], atol=1e-12)
+    assert_allclose(wrap_angle(back[2] - motion[2]), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1, 1.0])
+def test_a_match_is_judged_and_fused_as_many_are(rng: np.random.Generator, off: float) -> None:
+    expected, prior, doubt = random_pose(rng), random_covariance(rng), random_covariance(rng)
+    expected[2] = np.pi - 0.01  # the innovation goes over the edge of the circle
+    matched = compose(expected, off * random_pose(rng) + [0, 0, 0.02])
+    odometry, gated = Motions(expected[None], prior[None]), Motions(expected[None], 9.0 * prior[None])
+    fused = fuse(odometry, matched[None], doubt[None], np.array([True]))
+    agrees, motion, covariance = weigh(expected, prior, 9.0, matched, doubt)
+    assert agrees == consistent(gated, matched[None], doubt[None])[0]
+    assert_allclose(motion, fused.deltas[0], atol=1e-12)
+    assert_allclose(covariance, fused.covariances[0], atol=1e-12)

@@ -1,0 +1,47 @@
+"""Ranges in a scratch file: what was written comes back, whatever rows are asked for."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from processing.range_file import RangeFile, Ranges
+
+ROWS = np.random.default_rng(1).uniform(0, 20, (12, 30)).astype(np.float32)
+
+
+def write(path: Path, lengths: list[int], is_mirrored: bool = False) -> Ranges:
+    file = RangeFile(path)
+    for row, length in zip(ROWS, lengths, strict=True):
+        file.append(row[:length])
+    ranges = file.finish(is_mirrored)
+    file.close()
+    return ranges
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_rows_come_back_by_any_index(tmp_path: Path, is_mirrored: bool) -> None:
+    ranges = write(tmp_path / "a", [30] * 12, is_mirrored)
+    expected = ROWS[:, ::-1] if is_mirrored else ROWS
+    assert ranges.shape == (12, 30)
+    for which in (slice(None), slice(3, 7), slice(5, 5), np.array([2, 3, 4, 9, 1]), np.array([], np.int64), 6, -1):
+        assert_array_equal(ranges[which], expected[which])
+    with pytest.raises(IndexError):
+        ranges[12]
+
+
+def test_short_scans_are_padded_before_and_after_a_longer_one(tmp_path: Path) -> None:
+    lengths = [20, 20, 30, 25, 30, 20, 30, 30, 30, 30, 30, 10]
+    found = write(tmp_path / "a", lengths)[:]
+    for row, all_of_it, length in zip(found, ROWS, lengths, strict=True):
+        assert_array_equal(row[:length], all_of_it[:length])
+        assert np.isnan(row[length:]).all()
+
+
+def test_a_cut_of_it_is_small_and_finds_its_rows(tmp_path: Path) -> None:
+    cut = pickle.loads(pickle.dumps(write(tmp_path / "a", [30] * 12).cut(2, 9).cut(1, 4)))
+    assert len(pickle.dumps(cut)) < 500
+    assert_array_equal(cut[:], ROWS[3:7])
+    assert_array_equal(cut[np.array([3, 0])], ROWS[[6, 3]])
