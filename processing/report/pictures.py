@@ -27,7 +27,7 @@ TRAIL_M = 0.5
 
 def draw_overview(document: Mapping[str, Any], image: MapImage, trails: Mapping[str, Array]) -> str:
     """The stitched map, the runs' trails (n, 2), the edges between their nodes; names lead to their places below."""
-    drawing = Drawing(around(_corners(image), 1.0))
+    drawing = Drawing(around(_corners(image), 0.03 * max(image.pixels.shape) * image.resolution_m))
     drawing.map(image)
     for number, (run_id, trail) in enumerate(trails.items()):
         drawing.line(thin(trail, TRAIL_M), run_colour(number), 1, run_id)
