@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw_profiles.profile import Encoder
-from rtlog_server.devices.encoders import TurnCounter, counts_at, nearest_total, position_rad
+from rtlog_server.devices.encoders import Fix, ReadingMaker, TurnCounter, counts_at, nearest_total, position_rad
 
 COUNTS = 4096
 RADIUS_M = 0.35
@@ -74,6 +74,35 @@ def test_an_encoder_that_counts_turns_bridges_any_gap_until_it_loses_power() -> 
     total, doubtful = counter.count(40, 60 * 10**9 + TICK_NS)
     assert doubtful
     assert total == modulus + 20 * COUNTS + 40
+    assert counter.count(50, 60 * 10**9 + 2 * TICK_NS) == (modulus + 20 * COUNTS + 50, False)  # told once
+
+
+def test_positions_of_encoders_asked_in_turn_are_brought_to_one_stamp() -> None:
+    wheel = Encoder(name="wheel", role="left_wheel", counts_per_turn=COUNTS, wheel_radius_m=RADIUS_M)
+    maker = ReadingMaker([wheel, STEERING], {"wheel": COUNTS, "steering": COUNTS})
+    zero = round(350 / 360 * COUNTS)
+    for tick in range(4):
+        start_ns = tick * TICK_NS
+        # 400 counts a tick forward and 100 to the left, latched 10 ms apart: the stamp lies between
+        wheel_fix = Fix(400 * tick, start_ns, start_ns + 1)
+        steering_fix = Fix((zero + 100 * tick + 10) % COUNTS, start_ns + TICK_NS // 10, start_ns + TICK_NS // 10 + 1)
+        reading = maker.reading({"wheel": wheel_fix, "steering": steering_fix})
+    assert reading.measured_ns == 3 * TICK_NS + TICK_NS // 20
+    assert reading.counts[0] == 1200
+    per_count = 2 * math.pi / COUNTS
+    assert reading.positions_rad == (pytest.approx(1220 * per_count), pytest.approx(305 * per_count, abs=per_count))
+
+
+def test_a_position_where_no_wheel_can_be_is_told_before_it_is_counted() -> None:
+    wheel = Encoder(name="wheel", role="left_wheel", counts_per_turn=COUNTS, wheel_radius_m=RADIUS_M)
+    maker = ReadingMaker([wheel], {"wheel": COUNTS})
+    for tick in range(3):
+        fix = Fix(10 * tick, tick * TICK_NS, tick * TICK_NS)
+        assert maker.is_possible("wheel", fix)
+        maker.reading({"wheel": fix})
+    assert not maker.is_possible("wheel", Fix(COUNTS // 3, 3 * TICK_NS, 3 * TICK_NS))
+    assert maker.is_possible("wheel", Fix(COUNTS // 3, 60 * 10**9, 60 * 10**9))  # after a minute it can be anywhere
+    assert maker.is_possible("wheel", Fix(40, 3 * TICK_NS, 3 * TICK_NS))
 
 
 @given(st.floats(-math.pi + 0.01, math.pi - 0.01), st.booleans(), st.floats(-360, 360))

@@ -30,7 +30,7 @@ from rtlog_server.devices.sei.round_timing import RoundTiming
 TURNAROUND_NS = 500_000  # first guess of what a reply takes beyond the wire
 EMPTY_ROUNDS = 5  # without any position, then the port is opened anew
 BAUD_RECOVERY_ASKS = 5  # an encoder that lost its power is at 9600 baud again
-AGREEMENT_TURNS = 0.1  # two answers in one round that differ by less are no noise
+AGREEMENT_TURNS = 0.02  # two answers in one round that differ by less are no noise; at 5 m/s a wheel turns less
 EVENTS = ("retries", "timeouts", "garbled", "impossible", "doubtful turns")
 
 
@@ -98,6 +98,7 @@ class SeiEncoders(Device[EncoderReading]):
             self._timing.add(planned_ns, time.monotonic_ns())
         self._tally["retries"] += len(again)
         for name in again:
+            port.let_pass(self._reply_bytes)
             first, fixes[name] = fixes[name], self._ask(port, name, strobed_ns)
             if first is None and fixes[name] is None:
                 self._silent[name] = 0

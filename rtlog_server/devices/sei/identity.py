@@ -16,7 +16,7 @@ from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.port import SeiPort
 from rtlog_server.devices.sei.protocol import SeiError
 
-ATTEMPTS = 2
+ATTEMPTS = 3
 MODES: dict[int, Literal["single", "multi"]] = {
     protocol.position_reply_bytes(multi_turn=False): "single",
     protocol.position_reply_bytes(multi_turn=True): "multi",

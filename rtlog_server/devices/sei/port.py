@@ -17,6 +17,8 @@ from rtlog_server.devices.serial_port import LOST, open_serial_port
 
 TIMEOUT_S = 0.03  # for one reply; field drivers use 10 … 30 ms
 BAUD_CHANGE_S = 0.02  # its reply, of unpublished length, is waited out
+LATE_S = 0.002  # what an adapter may hold back
+DRAIN_S, DRAIN_BYTES = 0.1, 256
 ECHO_ATTEMPTS = 4  # for each encoder
 
 
@@ -57,6 +59,10 @@ class SeiPort:
             raise SeiError(f"{excess} bytes more than the reply")
         return Exchange(protocol.strip_echo(received, request, self._echo), sent_ns, complete_ns)
 
+    def let_pass(self, reply_bytes: int) -> None:
+        """Wait for an answer that may still be under way, that it is not taken for that to the next question."""
+        time.sleep(LATE_S + protocol.wire_ns(reply_bytes, self._bus.baud) * 1e-9)
+
     def strobe(self) -> int:
         """Let all encoders that are in strobe mode latch at once; when the request was given to the port."""
         return self._send_and_read(protocol.strobe_request(), int(self._echo))[0]
@@ -95,6 +101,8 @@ class SeiPort:
                 _, answer = self._send_and_read(request, len(request) + reply_bytes + 1)
                 received = answer if len(answer) > len(request) else received
                 verdicts.append(protocol.learn_echo(answer, request, reply_bytes))
+                if verdicts[-1] is None:
+                    self._drain()  # answers to others than us, or late ones
                 if len(verdicts) > 1 and verdicts[-1] is not None and verdicts[-1] == verdicts[-2]:
                     self._echo = verdicts[-1]
                     return
@@ -118,6 +126,13 @@ class SeiPort:
             time.sleep(BAUD_CHANGE_S)
             self._serial.baudrate = self._bus.baud
             self._serial.reset_input_buffer()
+
+    def _drain(self) -> None:
+        """Wait for a silence as long as a reply may take."""
+        with self._guard():
+            deadline = time.monotonic() + DRAIN_S
+            while self._serial.read(DRAIN_BYTES) and time.monotonic() < deadline:
+                pass
 
     def _send_and_read(self, request: bytes, length: int) -> tuple[int, bytes]:
         with self._guard():
