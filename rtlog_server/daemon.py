@@ -4,7 +4,7 @@
     driver threads ──samples──> tick loop ──bundles──> outbox ──┼──> zenoh, diagnostics, status
                                                                 │
 The law: neither a device nor the network can delay a tick. A device that is away is MISSING; a publishing process that
-does not keep up costs counted ticks, and one that died ends the server (systemd starts it anew).
+does not keep up costs counted ticks, and one that died or hangs for a minute ends the server (systemd starts it anew).
 """
 
 import faulthandler
@@ -34,6 +34,7 @@ from rtlog_server.ticker import Lateness, aligned_grid, ticks, utc_offset_ns
 log = logging.getLogger(__name__)
 
 QUEUE_TICKS = 300  # 30 s, some 2 MB
+MOST_REFUSED_TICKS = 300  # in a row, with the queue full: it will not come back
 COLLECT_TICKS = 100  # a garbage collection after every so many ticks; below a millisecond once all is frozen
 CLOSE_DEVICES_S = 0.5
 CLOSE_PUBLISHER_S = 5.0
@@ -104,7 +105,7 @@ def sample_for_ever(
             stamp_ns, dropped = tick.began_ns + offset_ns, publisher.outbox.dropped
             report = Report(stamp_ns, device_reports, lateness.summary(), dropped, realtime)
             notify(f"WATCHDOG=1\nSTATUS={status_line(report)}")
-        publisher.outbox.put(Bundle(tick.index, samples, report))
+        publisher.put(Bundle(tick.index, samples, report))
         if tick.index % COLLECT_TICKS == 0:
             gc.collect()
 
@@ -133,6 +134,13 @@ class PublishingProcess:
         theirs.close()
         self._connection.send(info)
         self.outbox = Outbox(self._connection, QUEUE_TICKS)
+        self._refused = 0  # ticks in a row
+
+    def put(self, bundle: Bundle) -> None:
+        """Queue a tick, or drop it. Raises: RTLogError: for too many ticks the process has taken nothing."""
+        self._refused = 0 if self.outbox.put(bundle) else self._refused + 1
+        if self._refused > MOST_REFUSED_TICKS:
+            raise RTLogError(f"the publishing process hangs: it has taken none of {QUEUE_TICKS + self._refused} ticks")
 
     def came_up(self) -> bool:
         """Hear what the process has to say: True once, when it has begun to publish.
@@ -157,5 +165,6 @@ class PublishingProcess:
             self._process.wait(CLOSE_PUBLISHER_S if drained else 0.0)
         except subprocess.TimeoutExpired as error:
             self._process.kill()
+            self._process.wait()
             message = f"the publishing process did not take the last ticks within {CLOSE_PUBLISHER_S:.0f} s"
             raise RTLogError(message) from error

@@ -13,6 +13,7 @@ from rtlog_server.check import check_devices
 from rtlog_server.cli import main
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.devices.finding import Finding
+from rtlog_server.devices.lms111.emulator import Lms111Emulator
 
 Found = dict[tuple[str, str], Finding]
 
@@ -86,6 +87,15 @@ def test_a_dirty_window_and_missing_scans_are_told_with_what_to_do(drive: Any, d
     assert found["laser/primary", "window"].found == "front window is dirty"
     assert "clean" in found["laser/primary", "window"].advice
     assert "cable" in found["laser/primary", "rate"].advice
+
+
+def test_a_scanner_that_starts_is_to_be_waited_for(drive: Any, drive_profile: Path) -> None:
+    with Lms111Emulator(start_s=60.0) as scanner:
+        text = drive_profile.read_text().replace(f"port = {drive.places['laser_port']}", f"port = {scanner.address[1]}")
+        found = check(parse_profile(text, "test"), time_limit_s=3.0)
+    assert wrong(found) == [("laser/primary", "state"), ("laser/primary", "connected")]
+    assert "does not measure yet" in found["laser/primary", "state"].found
+    assert "wait" in found["laser/primary", "state"].advice
 
 
 def test_a_reader_that_refuses_us_says_so(drive: Any, drive_profile: Path) -> None:
