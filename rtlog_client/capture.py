@@ -9,6 +9,7 @@ nanoseconds since the first scan's transmission, by the device's own clock.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,6 +72,19 @@ def capture_events(capture: Capture, device: str) -> Iterator[Event]:
             *(np.asarray(measured.ranges_m, np.float32), np.asarray(measured.intensities, np.float32)),
         )
         yield Event(measured.measured_ns, order, device, content)
+
+
+def transmission_delay_ns(capture: Capture) -> int:
+    """From the last ray of a sweep to its transmission, at most; real scanners take half a turn, or one and a half."""
+    events = {event.order: event for event in capture_events(capture, "")}
+    return max(
+        capture.pieces[order].elapsed_ns - event.stamp_ns - round(_sweep_s(event.content) * 1e9)
+        for order, event in events.items()
+    )
+
+
+def _sweep_s(scan: Any) -> float:
+    return float(scan.time_increment * max(len(scan.ranges) - 1, 0))
 
 
 def _pieces(data: bytes, dialect: Dialect) -> Iterator[Piece]:

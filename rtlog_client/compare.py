@@ -12,7 +12,7 @@ from typing import Any
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile, parse_profile
-from rtlog_client.capture import capture_events, read_capture
+from rtlog_client.capture import capture_events, read_capture, transmission_delay_ns
 from rtlog_client.compare_encoders import compare_encoders
 from rtlog_client.compare_scans import compare_scans
 from rtlog_client.compare_tags import compare_tags
@@ -92,9 +92,10 @@ def _compare_capture(
     if report.rate != 1.0:
         raise BadInputError(f"{went_in}: sent at another rate than its device's clock tells: there is no time to go by")
     causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
-    events = capture_events(read_capture(went_in), device)
+    capture = read_capture(went_in)
+    events, delay_ns = capture_events(capture, device), transmission_delay_ns(capture)
     turn_s = 1 / addressed_lasers(profile)[device].scan_frequency_hz
-    return compare_scans(device, events, came_out, report, ticks, causes, turn_s)
+    return compare_scans(device, events, came_out, report, ticks, causes, turn_s, delay_ns)
 
 
 def _compare_devices(

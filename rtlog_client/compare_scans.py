@@ -38,7 +38,7 @@ from rtlog_server.messages import decode, to_ns
 WINDOW_NS = 100_000_000  # a scan that came out is looked for so far around its stamp
 STAMP_NS = 5_000_000  # tolerance
 ANGLE_RAD = np.radians(2e-4)  # the wire has 1/10000°
-SILENCE_NS = 450_000_000  # the driver gives a scanner up after half a second
+SILENCE_NS = 450_000_000  # after half a second the driver wonders what its scanner does
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,10 @@ def compare_scans(
     ticks: TicksOut,
     causes: Causes,
     turn_s: float,
+    delay_ns: int = 0,
 ) -> DeviceComparison:
-    """`turn_s` is one turn of the head of the scanner that measured them the second time."""
+    """Of the scanner that measured them the second time, `turn_s` is a turn of the head, and `delay_ns` what it takes
+    from the last ray to the transmission."""
     result = DeviceComparison(device)
     numbered = enumerate(went_in)
     matcher = _Matcher(_scan(number, report.host_ns(event.stamp_ns), event.content) for number, event in numbered)
@@ -78,7 +80,7 @@ def compare_scans(
     stamps_ns = np.array(matcher.stamps_ns, np.int64)
     own: list[Cause] = hole_causes(device, positions, sequences, ticks) + gap_causes(device, stamps_ns, SILENCE_NS)
     causes = causes.also(own)
-    complete_ns = stamps_ns + np.round(np.array(matcher.turns) * turn_s * 1e9).astype(np.int64)
+    complete_ns = stamps_ns + delay_ns + np.round(np.array(matcher.turns) * turn_s * 1e9).astype(np.int64)
     extra = [late for late in extra if not matcher.note_changed(*late)]
     _judge_scans(result, matcher, complete_ns, report, ticks, causes)
     for scan, position in extra:

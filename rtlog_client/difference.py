@@ -129,10 +129,10 @@ def hole_causes(device: str, positions: Sequence[int], sequences: Sequence[int],
 
 
 def gap_causes(device: str, stamps_ns: NDArray[np.int64], least_ns: int) -> list[Cause]:
-    """Gaps of the input (UTC of the host): a scanner that falls silent is given up, and found anew."""
+    """Gaps of the input (UTC of the host): a scanner that falls silent may be given up, and has to be found anew."""
     return [
         Cause(
-            f"gap of {(b - a) * 1e-9:.1f} s in the recording that went in: the driver connected anew",
+            f"after a gap of {(b - a) * 1e-9:.1f} s in the recording that went in",
             (device,),
             b - TRANSIT_NS,
             b + RECOVERY_NS,

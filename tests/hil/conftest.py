@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hw_profiles.profile import load_profile
 from rtlog_client.log_file import LogWriter
 from rtlog_server.messages import (
     OK,
@@ -47,6 +48,7 @@ READ_NS = 40_000_000  # before the tick
 BEAMS = 541
 EPCS = ("E2003411B802011526370494", "E2003411B802011526370495")
 FORGIVEN = 0.005
+VEHICLE_S = 120.0  # what the tests of `vehicle` take at most
 NOTHING = np.empty(0)
 
 
@@ -203,50 +205,56 @@ def free_ports(count: int) -> list[int]:
     return ports
 
 
-class Rig:
-    """A folder, a profile at addresses of its own, and the commands."""
+def write_profile(folder: Path, tick_period_s: float = 0.1, auxiliary: bool = False, can: bool = False) -> Path:
+    """A vehicle at addresses of its own."""
+    primary, second, rfid, zenoh = free_ports(4)
+    bus = f'{{ kind = "sei", port = "{folder}/sei" }}'
+    if can:
+        bus = f'{{ kind = "can", interface = "udp_multicast", channel = "239.74.163.2", udp_port = {rfid} }}'
+    other = f'[lasers.auxiliary]\ndevice = {{ host = "127.0.0.1", port = {second} }}' if auxiliary else ""
+    path = folder / "bench.toml"
+    path.write_text(f"""
+        schema = 1
+        name = "bench"
+        tick_period_s = {tick_period_s}
+        vehicle = {{ kinematics = "differential", track_width_m = 1.6 }}
+        encoder_bus = {bus}
+        rfid = {{ model = "ALR-9650", device = {{ host = "127.0.0.1", port = {rfid} }} }}
+        zenoh = {{ listen = ["tcp/127.0.0.1:{zenoh}"] }}
+        [lasers.primary]
+        device = {{ host = "127.0.0.1", port = {primary} }}
+        {other}
+        [[encoders]]
+        name = "left_wheel"
+        role = "left_wheel"
+        wheel_radius_m = 0.35
+        address = 5
+        [[encoders]]
+        name = "right_wheel"
+        role = "right_wheel"
+        wheel_radius_m = 0.35
+        reversed = true
+        address = 6
+        """)
+    return path
 
-    def __init__(self, folder: Path, tick_period_s: float = 0.1, auxiliary: bool = False, can: bool = False) -> None:
+
+class Rig:
+    """A folder, a profile, and the commands."""
+
+    def __init__(self, folder: Path, profile: Path) -> None:
         self.folder = folder
-        primary, second, rfid, zenoh = free_ports(4)
-        self.endpoint = f"tcp/127.0.0.1:{zenoh}"
-        self.profile = folder / "bench.toml"
-        other = f'[lasers.auxiliary]\ndevice = {{ host = "127.0.0.1", port = {second} }}' if auxiliary else ""
-        bus = f'{{ kind = "sei", port = "{folder}/sei" }}'
-        if can:
-            bus = f'{{ kind = "can", interface = "udp_multicast", channel = "239.74.163.2", udp_port = {rfid} }}'
-        self.profile.write_text(f"""
-            schema = 1
-            name = "bench"
-            tick_period_s = {tick_period_s}
-            vehicle = {{ kinematics = "differential", track_width_m = 1.6 }}
-            encoder_bus = {bus}
-            rfid = {{ model = "ALR-9650", device = {{ host = "127.0.0.1", port = {rfid} }} }}
-            zenoh = {{ listen = ["{self.endpoint}"] }}
-            [lasers.primary]
-            device = {{ host = "127.0.0.1", port = {primary} }}
-            {other}
-            [[encoders]]
-            name = "left_wheel"
-            role = "left_wheel"
-            wheel_radius_m = 0.35
-            address = 5
-            [[encoders]]
-            name = "right_wheel"
-            role = "right_wheel"
-            wheel_radius_m = 0.35
-            reversed = true
-            address = 6
-            """)
+        self.profile = profile
+        self.endpoint = load_profile(profile).zenoh.listen[0].replace("0.0.0.0", "127.0.0.1")
 
     @contextmanager
-    def running(self) -> Iterator[tuple[Process, Process]]:
-        """The server and the recorder, which has begun to write."""
+    def running(self, *options: object) -> Iterator[tuple[Process, Process]]:
+        """The server and the recorder, which has begun to write; `options` are the recorder's."""
         with (
             command("rtlog_server.cli", "run", "--profile", self.profile) as server,
             command(
                 "rtlog_client.cli",
-                *("record", "-o", self.folder, "--name", "out", "--connect", self.endpoint, "--json"),
+                *("record", "-o", self.folder, "--name", "out", "--connect", self.endpoint, "--json", *options),
             ) as recorder,
         ):
             recorder.wait_for("writing")
@@ -297,12 +305,12 @@ def emulated(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture
 def rig(emulated: None, tmp_path: Path) -> Rig:
-    return Rig(tmp_path)
+    return Rig(tmp_path, write_profile(tmp_path))
 
 
 @pytest.fixture
 def make_rig(emulated: None, tmp_path: Path) -> Any:
-    return lambda **options: Rig(tmp_path, **options)
+    return lambda **options: Rig(tmp_path, write_profile(tmp_path, **options))
 
 
 @pytest.fixture
@@ -313,6 +321,21 @@ def make_drive(tmp_path: Path) -> Any:
         return path
 
     return make
+
+
+@pytest.fixture(scope="module")
+def vehicle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """A vehicle that stands there, its devices alive: those of --hw-profile, or emulated ones on a drive."""
+    folder = tmp_path_factory.mktemp("vehicle")
+    real = request.config.getoption("--hw-profile")
+    if real is not None:
+        yield Rig(folder, real)
+        return
+    rig = Rig(folder, write_profile(folder))
+    Drive(VEHICLE_S).write(folder / "drive.mcap")
+    with rig.replay(folder / "drive.mcap", "") as replay:
+        replay.wait_for("of drive")
+        yield rig
 
 
 @pytest.fixture

@@ -248,7 +248,7 @@ def test_a_gap_of_the_input_is_told_as_such(tmp_path: Path) -> None:
     write(tmp_path / "out.mcap", came_out, OFFSET)
     comparison = compare_recordings(tmp_path / "in.mcap", tmp_path / "out.mcap", report())
     assert comparison.same
-    cause = "gap of 0.9 s in the recording that went in: the driver connected anew"
+    cause = "after a gap of 0.9 s in the recording that went in"
     assert found(comparison, "laser/primary") == [("lost", k, cause) for k in range(28, 33)]
 
 
