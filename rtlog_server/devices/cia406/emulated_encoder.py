@@ -25,7 +25,6 @@ NEVER_NS = 1 << 62
 
 NO_OBJECT, NO_SUB_INDEX, READ_ONLY = 0x0602_0000, 0x0609_0011, 0x0601_0002  # SDO abort codes
 WRONG_LENGTH, OUT_OF_RANGE, NOT_NOW, NOT_MAPPABLE = 0x0607_0010, 0x0609_0030, 0x0800_0022, 0x0604_0041
-MAX_EVENT_TIMER_MS = 65535
 
 
 @dataclass(slots=True)
@@ -128,7 +127,8 @@ class EmulatedEncoder:
         return self.number(protocol.HEARTBEAT_MS) * 1_000_000
 
     def _event_period_ns(self) -> int:
-        return self.number((protocol.PDO_COMMUNICATION[1], protocol.EVENT_TIMER_MS)) * 1_000_000
+        event_timer = (protocol.PDO_COMMUNICATION[1], protocol.EVENT_TIMER_MS)
+        return self.number(event_timer if event_timer in self.objects else protocol.CYCLIC_TIMER_MS) * 1_000_000
 
     def _set_timers(self) -> None:
         """Anew after each change of what they depend on."""

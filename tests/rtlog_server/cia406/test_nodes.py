@@ -1,18 +1,15 @@
-"""Whatever a bus brings, and whatever a node answers: no exception, no growth, no position beyond the encoder's."""
+"""Who runs and who is to be brought up; and whatever a bus brings: no exception, no position beyond the encoder's."""
 
-from collections.abc import Iterator
-from contextlib import suppress
-
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hw_profiles.profile import CanBus, Encoder
-from rtlog_server.devices.cia406.configuration import NodeSettings, configure, identify
-from rtlog_server.devices.cia406.emulated_encoder import EmulatedEncoder
-from rtlog_server.devices.cia406.nodes import LOST_NS, SEEK_NS, Nodes
-from rtlog_server.devices.cia406.protocol import CanOpenError, Frame, encode_heartbeat
+from hw_profiles.profile import Encoder
+from rtlog_server.devices.cia406 import protocol
+from rtlog_server.devices.cia406.configuration import NodeSettings
+from rtlog_server.devices.cia406.nodes import LOST_NS, SEEK_NS, SETTLING_NS, Nodes
+from rtlog_server.devices.cia406.protocol import Frame, encode_heartbeat
 from rtlog_server.devices.cia406.rounds import SyncRounds
-from rtlog_server.devices.cia406.sdo import NodeObjects
 from rtlog_server.devices.device import TickGrid
 
 RANGE = 4096 * 4096
@@ -20,7 +17,7 @@ ENCODERS = [
     Encoder(name="left_wheel", role="left_wheel", address=5, wheel_radius_m=0.35),
     Encoder(name="right_wheel", role="right_wheel", address=6, wheel_radius_m=0.35),
 ]
-BUS = CanBus(channel="can0")
+SETTINGS = NodeSettings(2, 0, RANGE, "ok")
 MS = 1_000_000
 
 near = st.sampled_from([service + node for service in (0x80, 0x180, 0x280, 0x580, 0x700) for node in (5, 6, 7)])
@@ -31,7 +28,7 @@ def running_nodes() -> Nodes:
     nodes = Nodes(ENCODERS)
     nodes.rounds = SyncRounds(TickGrid(0, 100 * MS), 94_000, 0)
     for node in nodes:
-        node.run(NodeSettings(2, 0, RANGE, "ok"), 0)
+        node.run(SETTINGS, 0)
         nodes.rounds.join(node.name)
     return nodes
 
@@ -77,39 +74,24 @@ def test_only_what_the_encoders_send_is_counted_as_garbled() -> None:
     assert nodes.last_garbled == "heartbeat of node 5 has 0 bytes, not 1"
 
 
-class Answering:
-    """An SDO server that is an emulated encoder's until `spoilt` has something else to answer."""
-
-    def __init__(self, spoilt: Iterator[bytes | None]) -> None:
-        self._encoder = EmulatedEncoder(5, 4096, lambda _at_ns: 77)
-        self._spoilt = spoilt
-        self._reply: bytes | None = None
-        self.requests = 0
-
-    def send(self, frame: Frame) -> None:
-        answers = self._encoder.take(frame, 0)
-        self._reply = answers[0].data if answers else None
-        self.requests += 1
-
-    def await_reply(self, _node: int, _deadline_ns: int) -> bytes | None:
-        return next(self._spoilt, None) or self._reply
+def test_a_node_that_boots_is_brought_up_at_once() -> None:
+    nodes = running_nodes()
+    _, right = nodes
+    assert nodes.due(1) is None
+    nodes.take(encode_heartbeat(6, protocol.BOOT_UP), 1)
+    assert nodes.due(1) is right
+    right.begin()
+    right.run(SETTINGS, 2)
+    assert nodes.due(2) is None
+    assert nodes.tally["restarts"] == 1
 
 
-answers = st.lists(st.none() | st.binary(min_size=8, max_size=8), max_size=30)
-
-
-@given(answers)
-def test_any_answers_to_the_configuration_are_understood_or_refused(spoilt: list[bytes | None]) -> None:
-    server = Answering(iter(spoilt))
-    objects = NodeObjects(5, server.send, server.await_reply)
-    with suppress(CanOpenError):
-        assert "\n" not in identify(objects, 5, BUS)
-        assert configure(objects, 5, ENCODERS[0], BUS).total_range % 4096 == 0
-    assert server.requests < 300
-
-
-def test_an_encoder_that_answers_as_it_should_is_configured() -> None:
-    server = Answering(iter([]))
-    objects = NodeObjects(5, server.send, server.await_reply)
-    assert identify(objects, 5, BUS).endswith("serial number 83005")
-    assert configure(objects, 5, ENCODERS[0], BUS) == NodeSettings(2, 0, RANGE, "ok")
+@pytest.mark.parametrize("state", [protocol.STOPPED, protocol.PRE_OPERATIONAL])
+def test_a_node_that_does_not_stay_operational_is_brought_up_again(state: int) -> None:
+    nodes = running_nodes()
+    left, _ = nodes
+    nodes.take(encode_heartbeat(6, protocol.OPERATIONAL), SETTLING_NS)
+    nodes.take(encode_heartbeat(5, state), SETTLING_NS)  # sent before the start command came
+    assert nodes.due(SETTLING_NS) is None
+    nodes.take(encode_heartbeat(5, state), SETTLING_NS + 1)
+    assert nodes.due(SETTLING_NS + 1) is left
