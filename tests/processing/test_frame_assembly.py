@@ -188,3 +188,19 @@ def test_nothing_to_solve_stays() -> None:
     solved, weights = solve_frames(poses, [spur], no_links(), first_of(1))
     assert_allclose(solved, 0)
     assert len(weights) == 0
+
+
+def test_links_that_agree_close_a_loop_that_came_back_a_metre_off() -> None:
+    """The drive was surer of itself than it should have been: one link it outweighs, a dozen that agree it does not."""
+    corners = np.array([[0.0, 0, 0], [60, 0, np.pi / 2], [60, 60, np.pi], [0, 60, -np.pi / 2], [1.0, 0, 0]])
+    sure = np.diag([20.0, 20.0, 500.0])  # 5 cm and 0.1° a side
+    pieces = [
+        Condensed(np.array([k, k + 1]), np.array([np.zeros(3), relative(corners[k], corners[k + 1])]), sure)
+        for k in range(4)
+    ]
+    information = np.diag([50.0, 50.0, 500.0]) ** 2
+    for count, off in ((12, 0.1), (1, 1.1)):
+        links = Links.of(np.tile([0, 4], (count, 1)), np.zeros((count, 3)), np.tile(information, (count, 1, 1)), True)
+        poses, weights = solve_frames(corners, pieces, links, first_of(5))
+        assert np.hypot(*poses[4, :2]) < off
+        assert np.all(weights > 0.9) == (count == 12)
