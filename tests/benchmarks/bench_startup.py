@@ -1,0 +1,47 @@
+"""How soon rtlog-atlas answers: its help, and a small build once the kernels are compiled."""
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from building import build
+from table import Figure, report
+
+from processing.simulation.simulate import simulate
+
+ROUNDS = 5
+MOST_HELP_S, MOST_START_S = 0.3, 2.0
+SMALL = """
+schema = 1
+name = "short"
+profile = "canmet_trailer"
+drifts = [{ points = [[0, 0], [40, 0]], width_m = 4.5, roughness_m = 0.2 }]
+runs = [{ name = "out", waypoints = [[8, 0], [14, 0]], speed_m_s = 2.0 }]
+"""
+
+
+def help_s() -> float:
+    began = time.monotonic()
+    subprocess.run([sys.executable, "-m", "processing.cli", "--help"], check=True, capture_output=True)
+    return time.monotonic() - began
+
+
+def main() -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "short.toml").write_text(SMALL)
+        (run,) = simulate(Path(folder) / "short.toml", Path(folder) / "short")
+        build([run.path], Path(folder) / "first.atlas")
+        seconds = min(build([run.path], Path(folder) / f"{k}.atlas").wall_s for k in range(ROUNDS))
+    return report(
+        "starting up",
+        [
+            Figure("rtlog-atlas --help", min(help_s() for _ in range(ROUNDS)), "s", most=MOST_HELP_S),
+            Figure(f"a second build, of {run.ticks} ticks, from start to end", seconds, "s", most=MOST_START_S),
+        ],
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
