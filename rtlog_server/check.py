@@ -17,9 +17,9 @@ from hw_profiles.profile import CanBus, Laser, Profile, RfidDevice, SeiBus
 from rtlog_server.devices import open_devices
 from rtlog_server.devices.alien.check import check_reader
 from rtlog_server.devices.device import Device, DeviceError, TickGrid
-from rtlog_server.devices.finding import Finding
 from rtlog_server.devices.lms111.check import check_scanner
 from rtlog_server.devices.sei.check import check_bus
+from rtlog_server.finding import Finding
 
 TIME_LIMIT_S = (
     5.0  # to connect: an encoder bus left at the wrong speed takes a second attempt, a scanner starts its motor
@@ -92,7 +92,7 @@ def _watch(device: Device[Any], place: Place, time_limit_s: float, watch_s: floa
     deadline = time.monotonic() + time_limit_s
     while not device.connected:
         if time.monotonic() > deadline:
-            return [Finding("connected", device.message, False, place.advice)]
+            return [Finding("driver", device.message, False, place.advice)]
         time.sleep(POLL_S)
     stamps_ns: list[int] = []
     age_s = float("inf")
@@ -103,7 +103,7 @@ def _watch(device: Device[Any], place: Place, time_limit_s: float, watch_s: floa
         stamps_ns += [sample.measured_ns for sample in collected.samples]
         age_s = collected.age_s
     well = device.connected and device.message == "connected"
-    findings = [Finding("connected", device.message, well, "" if well else place.advice)]
+    findings = [Finding("driver", device.message, well, "" if well else place.advice)]
     if place.rate_hz is not None:
         findings += _judge_stream(stamps_ns, age_s, place.rate_hz, watch_s)
     return findings

@@ -9,9 +9,10 @@ from dataclasses import asdict
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.profile import load_profile, parse_profile, read_profile_text, shipped_profiles
+from rtlog_server.finding import Finding
 from rtlog_server.realtime import become_realtime
 
-COLUMNS = ("device", "", "", "found", "what to do next")
+COLUMNS = ("device", "", "", "found")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,9 +62,16 @@ def check(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([{"device": device} | asdict(finding) for device, finding in rows], indent=2))
     else:
-        told = [(device, f.subject, "ok" if f.well else "WRONG", f.found, f.advice) for device, f in rows]
-        print(format_table([COLUMNS, *told]))
+        print(format_findings(rows))
     return 0 if all(finding.well for _, finding in rows) else 1
+
+
+def format_findings(rows: Sequence[tuple[str, Finding]]) -> str:
+    """A table of devices and findings; what to do next stands below what is wrong."""
+    cells = [(device, f.subject, "ok" if f.well else "WRONG", f.found) for device, f in rows]
+    heading, *lines = format_table([COLUMNS, *cells]).splitlines()
+    advised = (f"{line}\n  -> {f.advice}" if f.advice else line for line, (_, f) in zip(lines, rows, strict=True))
+    return "\n".join([heading, *advised])
 
 
 def format_table(rows: Sequence[tuple[str, ...]]) -> str:

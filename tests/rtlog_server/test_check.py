@@ -12,8 +12,8 @@ from hw_profiles.profile import CanBus, Profile, load_profile, parse_profile
 from rtlog_server.check import check_devices
 from rtlog_server.cli import main
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
-from rtlog_server.devices.finding import Finding
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
+from rtlog_server.finding import Finding
 
 Found = dict[tuple[str, str], Finding]
 
@@ -31,7 +31,7 @@ def wrong(found: Found) -> list[tuple[str, str]]:
 def test_what_is_well_is_told_in_a_table(drive: Any, drive_profile: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--profile", str(drive_profile)]) == 0
     heading, *rows = capsys.readouterr().out.splitlines()
-    assert heading.split() == ["device", "found", "what", "to", "do", "next"]
+    assert heading.split() == ["device", "found"]
     assert not [row for row in rows if " ok " not in row]
     told = {" ".join(row.split(" ok ")[0].split()): row.split(" ok ")[1].strip() for row in rows}
     assert "serial number 18090362, firmware" in told["laser/primary identity"]
@@ -59,9 +59,9 @@ def test_one_silent_encoder_is_named(drive: Any, drive_profile: Path) -> None:
         found = check(load_profile(drive_profile))
     finally:
         drive.encoders.mute(1, muted=False)
-    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "connected")]
+    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "driver")]
     assert "address 1" in found["encoders", "identity of right_wheel"].advice
-    assert found["encoders", "connected"].found == "no answer from right_wheel"
+    assert found["encoders", "driver"].found == "no answer from right_wheel"
 
 
 def test_a_device_that_takes_the_connection_and_says_nothing_is_away(drive: Any, drive_profile: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_dirty_window_and_missing_scans_are_told_with_what_to_do(drive: Any, d
     finally:
         drive.laser.set_status(0)
         drive.scan_s = 0.02
-    assert wrong(found) == [("laser/primary", subject) for subject in ("window", "connected", "rate")]
+    assert wrong(found) == [("laser/primary", subject) for subject in ("window", "driver", "rate")]
     assert found["laser/primary", "window"].found == "front window is dirty"
     assert "clean" in found["laser/primary", "window"].advice
     assert "cable" in found["laser/primary", "rate"].advice
@@ -93,7 +93,7 @@ def test_a_scanner_that_starts_is_to_be_waited_for(drive: Any, drive_profile: Pa
     with Lms111Emulator(start_s=60.0) as scanner:
         text = drive_profile.read_text().replace(f"port = {drive.places['laser_port']}", f"port = {scanner.address[1]}")
         found = check(parse_profile(text, "test"), time_limit_s=3.0)
-    assert wrong(found) == [("laser/primary", "state"), ("laser/primary", "connected")]
+    assert wrong(found) == [("laser/primary", "state"), ("laser/primary", "driver")]
     assert "does not measure yet" in found["laser/primary", "state"].found
     assert "wait" in found["laser/primary", "state"].advice
 
@@ -131,7 +131,7 @@ def test_encoders_on_can_are_asked_by_their_driver(drive: Any, drive_profile: Pa
         assert "no errors" in found["encoders", "bus"].found
         emulator.mute(9)
         found = check(profile)
-    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "connected")]
+    assert wrong(found) == [("encoders", "identity of right_wheel"), ("encoders", "driver")]
     assert "node id 9" in found["encoders", "identity of right_wheel"].advice
 
 

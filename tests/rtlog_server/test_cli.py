@@ -56,13 +56,15 @@ def test_check_names_every_device_that_is_away(absent_profile: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert result.returncode == 1
     assert result.stderr == ""
-    _, *rows = result.stdout.splitlines()
+    _, *lines = result.stdout.splitlines()
+    rows, advice = lines[::2], lines[1::2]
     assert [row.split()[:3] for row in rows] == [
         [device, "reachable", "WRONG"] for device in ("laser/primary", "encoders", "rfid")
     ]
     assert "refused" in rows[0]
     assert "No such file" in rows[1]
-    assert "ping 127.0.0.1" in rows[2]
+    assert all(line.startswith("  -> ") for line in advice)
+    assert "ping 127.0.0.1" in advice[2]
 
 
 def test_a_signal_before_the_publisher_is_up_ends_it_cleanly(absent_profile: Path) -> None:

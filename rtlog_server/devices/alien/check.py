@@ -6,7 +6,7 @@ import time
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices.alien.console import Console
 from rtlog_server.devices.alien.identity import ReaderIdentity, read_identity
-from rtlog_server.devices.finding import Finding
+from rtlog_server.finding import Finding
 
 CLOCK_S = 3600.0  # a reader whose clock is off by more was never set
 

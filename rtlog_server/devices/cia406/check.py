@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hw_profiles.profile import CanBus, Encoder
 from rtlog_server.devices.device import Device, DeviceError
 from rtlog_server.devices.encoders import EncoderReading
-from rtlog_server.devices.finding import Finding
+from rtlog_server.finding import Finding
 
 
 def judge_bus(bus: CanBus, encoders: Sequence[Encoder], driver: Device[EncoderReading]) -> list[Finding]:

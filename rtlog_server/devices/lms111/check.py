@@ -1,9 +1,9 @@
 """Is the scanner well? In: its address. Out: rows for the table of `rtlog-server check`; nothing in it is changed."""
 
 from hw_profiles.profile import LaserDevice
-from rtlog_server.devices.finding import Finding
 from rtlog_server.devices.lms111.identity import ScannerIdentity, identify
 from rtlog_server.devices.lms111.protocol import CONTAMINATION
+from rtlog_server.finding import Finding
 
 
 def check_scanner(settings: LaserDevice) -> list[Finding]:

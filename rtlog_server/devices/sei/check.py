@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from hw_profiles.profile import Encoder, SeiBus
-from rtlog_server.devices.finding import Finding
 from rtlog_server.devices.sei.identity import EncoderIdentity, identify_bus
+from rtlog_server.finding import Finding
 
 
 def check_bus(bus: SeiBus, encoders: Sequence[Encoder]) -> list[Finding]:
