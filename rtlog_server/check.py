@@ -27,6 +27,7 @@ TIME_LIMIT_S = (
 WATCH_S = 2.0  # over which rates are measured, or three ticks
 RATE_TOLERANCE = 0.2
 POLL_S = 0.02
+ENCODERS_UNWELL = "see the rows of the encoders"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,7 @@ class Place:
     ask: Callable[[Device[Any]], list[Finding]]  # who it is and how; raises DeviceError if it is not there
     rate_hz: float | None  # of its samples; None: they come when there is something to tell
     advice: str  # what to look at when it does not answer
+    unwell: str  # and when it answers, but its driver has something to say
 
 
 def check_devices(
@@ -103,7 +105,7 @@ def _watch(device: Device[Any], place: Place, time_limit_s: float, watch_s: floa
         stamps_ns += [sample.measured_ns for sample in collected.samples]
         age_s = collected.age_s
     well = device.connected and device.message == "connected"
-    findings = [Finding("driver", device.message, well, "" if well else place.advice)]
+    findings = [Finding("driver", device.message, well, "" if well else place.unwell)]
     if place.rate_hz is not None:
         findings += _judge_stream(stamps_ns, age_s, place.rate_hz, watch_s)
     return findings
@@ -139,14 +141,14 @@ def _scanner(laser: Laser) -> Place:
     settings = laser.device
     assert settings is not None  # checked by the caller
     advice = f"power, cable; ping {settings.host}; CoLa port {settings.port} (2111 or 2112)"
-    return Place(lambda _: check_scanner(settings), settings.scan_frequency_hz, advice)
+    return Place(lambda _: check_scanner(settings), settings.scan_frequency_hz, advice, "see window and state")
 
 
 def _encoders(profile: Profile, bus: SeiBus | CanBus) -> Place:
     rate_hz = 1 / profile.tick_period_s
     if isinstance(bus, SeiBus):
         advice = f"adapter, encoders' power, addresses; ls -l {bus.port}; group dialout"
-        return Place(lambda _: check_bus(bus, profile.encoders), rate_hz, advice)
+        return Place(lambda _: check_bus(bus, profile.encoders), rate_hz, advice, ENCODERS_UNWELL)
     advice = "encoders' power, node ids, terminators, bit rate"
     if bus.interface == "socketcan":
         advice += f"; ip -details link show {bus.channel}"
@@ -158,11 +160,12 @@ def _encoders(profile: Profile, bus: SeiBus | CanBus) -> Place:
 
         return judge_bus(bus, profile.encoders, device)
 
-    return Place(ask_driver, rate_hz, advice)
+    return Place(ask_driver, rate_hz, advice, ENCODERS_UNWELL)
 
 
 def _reader(settings: RfidDevice) -> Place:
     advice = f"power, cable; ls -l {settings.serial_port}; group dialout"
     if not settings.serial_port:
         advice = f"power, cable; ping {settings.host}; telnet {settings.host} {settings.port}; user and password"
-    return Place(lambda _: check_reader(settings), None, advice)
+    unwell = "a firewall of this board, or stream_host and stream_port of the profile; its tags are read all the same"
+    return Place(lambda _: check_reader(settings), None, advice, unwell)
