@@ -41,7 +41,7 @@ def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[di
             "what": f"tag {epc}",
             "run": run.run.run_id,
             "ticks": [int(run.run.scan_ticks[found.centre]) for found in run.passes if found.epc == epc],
-            "reason": "it was read at more than one place: moved, or two tags of one EPC",
+            "reason": "by its distance to other tags it was read at more than one place: moved, or two tags of one EPC",
         }
         for epc in moved
         for run in runs
