@@ -205,3 +205,12 @@ def test_what_a_reader_sends_is_read(epc: str, antenna: int, count: int, rssi: f
     text = tag_line.parse_tag(tag_line.format_tag(tag, "TEXT", ""))
     assert text is not None
     assert (text.epc, text.antenna, text.count, text.last_seen_ms) == (epc, antenna, count, seen_ms)
+
+
+@given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=8))
+def test_it_makes_no_difference_how_the_wire_cuts(data: bytes, cuts: list[int]) -> None:
+    whole, pieces = protocol.line_splitter(), protocol.line_splitter()
+    ends = [*sorted(cuts), len(data)]
+    lines = [line for start, end in zip([0, *ends], ends, strict=False) for line in pieces.feed(data[start:end])]
+    assert lines == whole.feed(data)
+    assert pieces.rest == whole.rest
