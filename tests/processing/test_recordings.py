@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hw_profiles.errors import BadInputError
+from processing.pipeline import Config, build
 from processing.read_log import read_log
 from processing.recordings import group_parts
 from rtlog_client.log_file import LogWriter, read_info, read_messages
@@ -76,3 +77,11 @@ def test_two_runs_of_one_name_are_not_taken_for_one(whole: Path, tmp_path: Path,
         BadInputError, match=r"part0\.mcap and .*part1\.mcap are both called run small-back, and are not"
     ):
         group_parts([second, first])
+
+
+def test_a_split_run_is_mapped_as_the_whole_one(parts: list[Path], whole: Path) -> None:
+    one, split = build([whole], None, Config()), build([parts[1], parts[2], parts[0]], None, Config())
+    assert list(split.trajectories) == ["small-back"]
+    for ours, theirs in zip(split.trajectories["small-back"], one.trajectories["small-back"], strict=True):
+        assert np.array_equal(ours, theirs)
+    assert split.document["edges"] == one.document["edges"]
