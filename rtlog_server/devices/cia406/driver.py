@@ -87,9 +87,11 @@ class Cia406Encoders(Device[EncoderReading]):
     def _bring_up(self, node: Node) -> None:
         """Configure the node and start it; what is wrong with it is told in its `problem`. Raises: DeviceError."""
         port = self._opened()
-        node.begin()
         objects = NodeObjects(node.address, port.send, self._await_reply)
         pre_operational = protocol.nmt_command(protocol.ENTER_PRE_OPERATIONAL, node.address)
+        if node.running:  # so it is ours, and if somebody stopped it, it answers only after this
+            port.send(pre_operational)
+        node.begin()
         try:
             self.identity[node.name] = identify(objects, node.address, self._bus)
             port.send(pre_operational)
