@@ -27,7 +27,7 @@ from rtlog_server.topics import JOINT_STATES
 STAMP_NS = 10_000_000  # tolerance: encoders on a bus are latched one after the other, and share a stamp
 COUNTS = 1.5
 SPEED_NS = 100_000_000  # before a reading, over which its speed is taken
-ROUND_NS = 10_000_000  # before its tick the encoders are being asked
+ROUND_NS = 20_000_000  # before its tick the encoders are being asked
 BROUGHT_NS = 5_000_000  # by which a driver may bring a reading to its stamp, at that speed
 
 
@@ -62,8 +62,8 @@ def compare_encoders(
         if missing := [name for name in wheels if name not in names]:
             found.append(("lost", position, stamp_ns, ", ".join(missing)))
     for what, position, stamp_ns, detail in sorted(found, key=lambda one: one[1]):
-        # a stall in the round before a tick, which may take a while, makes the reading late
-        cause = causes.of("encoders", stamp_ns - ticks.period_ns, ticks.at(position) - ROUND_NS, ticks.at(position))
+        due_ns = ticks.at(position) - ROUND_NS, ticks.at(position)
+        cause = causes.of("encoders", stamp_ns - ticks.period_ns, due_ns, ticks.at(position))
         recorded_ns = report.recorded_ns(stamp_ns)
         result.differences.append(Difference("encoders", what, ticks.index(position), recorded_ns, cause, detail))
     result.same = result.went_in - len({d.tick for d in result.differences})

@@ -85,7 +85,7 @@ def compare_scans(
     _judge_scans(result, matcher, complete_ns, report, ticks, causes)
     for scan, position in extra:
         if stamps_ns.size and stamps_ns[0] - STAMP_NS <= scan.stamp_ns <= stamps_ns[-1] + STAMP_NS:
-            cause = causes.of(device, scan.stamp_ns, scan.stamp_ns, ticks.at(position))
+            cause = causes.of(device, scan.stamp_ns, (scan.stamp_ns, ticks.at(position)), ticks.at(position))
             stamp_ns = report.recorded_ns(scan.stamp_ns)
             result.differences.append(Difference(device, "extra", ticks.index(position), stamp_ns, cause))
     return result
@@ -175,7 +175,8 @@ def _judge_scans(
                 what, detail = "stamp", f"{error_ns * 1e-6:+.2f} ms"
         if what:
             tick = int(expected[number])
-            cause = causes.of(result.device, stamp_ns, int(complete_ns[number]), ticks.at(int(latest[number])))
+            due_ns = int(complete_ns[number])
+            cause = causes.of(result.device, stamp_ns, (due_ns, due_ns), ticks.at(int(latest[number])))
             recorded_ns = report.recorded_ns(stamp_ns)
             result.differences.append(Difference(result.device, what, ticks.index(tick), recorded_ns, cause, detail))
     result.differences.reverse()

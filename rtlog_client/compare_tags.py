@@ -68,7 +68,7 @@ def compare_tags(
     found += [(ticks.at(k), "silent", "no message") for k in range(first, last + 1) if k not in present]
     for stamp_ns, what, detail in sorted(found):
         position = int(ticks.first_after(np.array([stamp_ns]))[0])
-        cause = causes.of("rfid", stamp_ns, stamp_ns, ticks.at(position))
+        cause = causes.of("rfid", stamp_ns, (stamp_ns, stamp_ns), ticks.at(position))
         recorded_ns = report.recorded_ns(stamp_ns)
         result.differences.append(Difference("rfid", what, ticks.index(position), recorded_ns, cause, detail))
     return result

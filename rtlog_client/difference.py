@@ -77,14 +77,14 @@ class Causes:
     def also(self, causes: Sequence[Cause]) -> "Causes":
         return Causes([*causes, *self._causes], self._ticks)
 
-    def of(self, device: str, from_ns: int, due_ns: int, to_ns: int) -> str:
-        """Of a sample that was measured at `from_ns`, due to arrive at `due_ns` and belongs to the tick at `to_ns`."""
+    def of(self, device: str, from_ns: int, due_ns: tuple[int, int], to_ns: int) -> str:
+        """Of a sample that was measured at `from_ns`, due to arrive within `due_ns`, and is of the tick at `to_ns`."""
         if to_ns <= self._ticks.first_ns - self._ticks.period_ns:
             return BEFORE
         if to_ns > self._ticks.last_ns:
             return AFTER
         for cause in self._causes:
-            begin_ns, end_ns = (due_ns, due_ns) if cause.brief else (from_ns, to_ns)
+            begin_ns, end_ns = due_ns if cause.brief else (from_ns, to_ns)
             if (not cause.devices or device in cause.devices) and cause.from_ns <= end_ns and begin_ns <= cause.to_ns:
                 return cause.text
         return UNEXPLAINED

@@ -29,6 +29,7 @@ KINDS = {
     "swap": 'for_s = 1.0\nother = "laser/auxiliary"',
 }
 PAGE = 4096
+TICK_NS = 100_000_000
 
 
 def script(seconds: float) -> str:
@@ -104,7 +105,7 @@ def test_soak(make_rig: Any, make_drive: Any, two_lasers: Any, request: pytest.F
     with capsys.disabled():
         print(f"\n{figures(played, watch, seconds)}")
     assert played.comparison["missing_ticks"] == 0
-    assert played.comparison["overruns"] == 0
+    assert played.comparison["overruns"] <= stood_whole_ticks(played)
     assert played.summary["lost"] == {}
     assert played.unexplained() == []
     for name in watch.rows:
@@ -115,10 +116,18 @@ def test_soak(make_rig: Any, make_drive: Any, two_lasers: Any, request: pytest.F
         assert accounted >= device["went_in"], device["device"]
 
 
+def stood_whole_ticks(played: Any) -> int:
+    """In how many ticks nothing on this machine ran, not even at real-time priority, as a virtual machine may be."""
+    stalls = (stall["to_ns"] - stall["from_ns"] for stall in played.report["stalls"])
+    return sum(stall // TICK_NS + 1 for stall in stalls if stall > TICK_NS)
+
+
 def figures(played: Any, watch: MemoryWatch, seconds: float) -> str:
     comparison = played.comparison
+    stalls_ms = [(stall["to_ns"] - stall["from_ns"]) * 1e-6 for stall in played.report["stalls"]]
     lines = [
-        f"{seconds:g} s, {len(played.report['faults'])} faults, {len(played.report['stalls'])} stalls of the machine",
+        f"{seconds:g} s, {len(played.report['faults'])} faults",
+        f"the machine stood still {len(stalls_ms)} times, {max(stalls_ms, default=0.0):.0f} ms at most",
         f"{comparison['ticks']} ticks, {comparison['missing_ticks']} missing, {comparison['overruns']} a period late",
     ]
     for device in comparison["devices"]:
