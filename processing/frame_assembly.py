@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from processing.geometry import compose, inverse, relative, relative_jacobians, wrap_angle
-from processing.pose_graph import CORNER, Links, boundary_information, residuals, robust_weights
+from processing.pose_graph import CORNER, Links, boundary_information, residuals, robust_weights, squared_distances
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -55,6 +55,47 @@ def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variabl
     return Condensed(variables, local, np.linalg.cholesky((seen + seen.T) / 2).T)
 
 
+@dataclass(frozen=True, slots=True)
+class _Alike:
+    """All pieces with b variables, g of them: what is done for one is done for all at once."""
+
+    variables: Ints  # (g, b)
+    motions: Array  # (g, b - 1, 3) of poses 1 … b-1 seen from pose 0, as the pieces have them
+    roots: Array  # (g, 3b - 3, 3b - 3)
+
+    def errors(self, poses: Array) -> Array:
+        """(g, 3b - 3), whitened."""
+        there = poses[self.variables]
+        error = relative(there[:, :1], there[:, 1:]) - self.motions
+        error[..., 2] = wrap_angle(error[..., 2])
+        return np.asarray(np.einsum("gij,gj->gi", self.roots, error.reshape(len(error), -1)))
+
+    def jacobians(self, poses: Array) -> Array:
+        """(g, 3b - 3, 3b) of the same."""
+        there = poses[self.variables]
+        j_a, j_b = relative_jacobians(np.broadcast_to(there[:, :1], there[:, 1:].shape), there[:, 1:])
+        count, size = self.roots.shape[:2]
+        columns = self.roots.reshape(count, size, -1, 3)
+        first = np.einsum("gikc,gkcd->gid", columns, j_a)
+        others = np.einsum("gikc,gkcd->gikd", columns, j_b).reshape(count, size, -1)
+        return np.concatenate([first, others], axis=2)
+
+
+def _group(pieces: list[Condensed]) -> list[_Alike]:
+    """Pieces by the number of their variables; what has only one says nothing."""
+    sizes: dict[int, list[Condensed]] = {}
+    for piece in pieces:
+        sizes.setdefault(len(piece.variables), []).append(piece)
+    groups = []
+    for size, members in sorted(sizes.items()):
+        if size > 1:
+            local = np.array([piece.local for piece in members])
+            variables = np.array([piece.variables for piece in members], np.int64)
+            roots = np.array([piece.root for piece in members])
+            groups.append(_Alike(variables, relative(local[:, :1], local[:, 1:]), roots))
+    return groups
+
+
 def solve_frames(
     first_guess: Array, pieces: list[Condensed], links: Links, fixed: NDArray[np.bool_], max_iterations: int = 50
 ) -> tuple[Array, Array]:
@@ -63,32 +104,31 @@ def solve_frames(
     With falling corners (graduated non-convexity): a loop that comes back a metre off is closed by its links, which
     agree, before any of them is doubted. `fixed` (V,): one variable of each connected part, at least.
     """
-    poses = first_guess
-    for corner in GRADUAL:
-        poses = _minimise(poses, pieces, links, fixed, corner, max_iterations)
-    return poses, robust_weights(_squares(poses, links), links.robust, CORNER)
+    poses, groups = first_guess, _group(pieces)
+    for corner in GRADUAL if np.any(links.robust) else (CORNER,):
+        poses = _minimise(poses, groups, links, fixed, corner, max_iterations)
+    return poses, robust_weights(squared_distances(poses, links), links.robust, CORNER)
 
 
 def _minimise(
     first_guess: Array,
-    pieces: list[Condensed],
+    groups: list[_Alike],
     links: Links,
     fixed: NDArray[np.bool_],
     corner: float,
     max_iterations: int,
 ) -> Array:
-    poses = first_guess.copy()
-    free = np.flatnonzero(np.repeat(~fixed, 3))
-    cost, damping = _cost(poses, pieces, links, corner), 0.0
+    poses, free = first_guess.copy(), np.flatnonzero(np.repeat(~fixed, 3))
+    cost, damping = _cost(poses, groups, links, corner), 0.0
     for _ in range(max_iterations if len(free) else 0):
-        jacobian, error = _linearise(poses, pieces, links, corner)
+        jacobian, error = _linearise(poses, groups, links, corner)
         jacobian = jacobian[:, free]
         normal = (jacobian.T @ jacobian).tocsc()
         normal = normal + damping * sp.diags(normal.diagonal()).tocsc()
         tried = poses.copy()
         tried.reshape(-1)[free] -= factorise(normal.tocsc()).solve(jacobian.T @ error)
         tried[:, 2] = wrap_angle(tried[:, 2])
-        tried_cost = _cost(tried, pieces, links, corner)
+        tried_cost = _cost(tried, groups, links, corner)
         if tried_cost <= cost * (1 + 1e-9) + 1e-12:
             settled = np.abs(relative(poses, tried)).max() < 1e-6
             poses, cost, damping = tried, tried_cost, damping / 10
@@ -101,59 +141,41 @@ def _minimise(
     return poses
 
 
-def _squares(poses: Array, links: Links) -> Array:
-    error = residuals(poses, links)
-    return np.asarray(np.einsum("mi,mij,mj->m", error, links.informations, error))
-
-
-def _piece_error(poses: Array, piece: Condensed) -> Array:
-    there, here = poses[piece.variables], piece.local
-    error = relative(there[0], there[1:]) - relative(here[0], here[1:])
-    error[:, 2] = wrap_angle(error[:, 2])
-    return np.asarray(piece.root @ error.ravel())
-
-
-def _cost(poses: Array, pieces: list[Condensed], links: Links, corner: float) -> float:
-    squares = _squares(poses, links)
+def _cost(poses: Array, groups: list[_Alike], links: Links, corner: float) -> float:
+    squares = squared_distances(poses, links)
     robust = np.where(links.robust, corner * squares / (corner + squares), squares).sum()
-    return float(
-        robust + sum(np.square(_piece_error(poses, piece)).sum() for piece in pieces if len(piece.variables) > 1)
-    )
+    return float(robust + sum(np.square(group.errors(poses)).sum() for group in groups))
 
 
-def _linearise(poses: Array, pieces: list[Condensed], links: Links, corner: float) -> tuple[sp.csc_matrix, Array]:
+def _linearise(poses: Array, groups: list[_Alike], links: Links, corner: float) -> tuple[sp.csc_matrix, Array]:
     """The whitened errors and their sparse Jacobian over all variables."""
-    rows, columns, values, errors, height = [], [], [], [], 0
+    rows, columns, values, errors, height = [], [], [], [np.zeros(0)], 0
 
-    def add(block: Array, variable: int) -> None:
-        r, c = np.indices(block.shape)
-        rows.append(height + r.ravel())
-        columns.append(3 * variable + c.ravel())
-        values.append(block.ravel())
+    def add(blocks: Array, variables: Ints, error: Array) -> None:
+        """Blocks (g, r, 3b) of variables (g, b), and their errors (g, r)."""
+        nonlocal height
+        row = height + np.arange(error.size).reshape(error.shape)
+        column = (3 * variables[..., None] + np.arange(3)).reshape(len(variables), -1)
+        rows.append(np.broadcast_to(row[:, :, None], blocks.shape).ravel())
+        columns.append(np.broadcast_to(column[:, None, :], blocks.shape).ravel())
+        values.append(blocks.ravel())
+        errors.append(error.ravel())
+        height += error.size
 
-    for piece in pieces:
-        if len(piece.variables) < 2:
-            continue
-        there = poses[piece.variables]
-        j_a, j_b = relative_jacobians(np.broadcast_to(there[0], there[1:].shape), there[1:])
-        add(piece.root @ j_a.reshape(-1, 3), piece.variables[0])
-        for k, block in enumerate(j_b):
-            add(piece.root[:, 3 * k : 3 * k + 3] @ block, piece.variables[k + 1])
-        errors.append(_piece_error(poses, piece))
-        height += len(errors[-1])
+    for group in groups:
+        add(group.jacobians(poses), group.variables, group.errors(poses))
     if len(links):
-        weights = robust_weights(_squares(poses, links), links.robust, corner)
+        weights = robust_weights(squared_distances(poses, links), links.robust, corner)
         roots = np.sqrt(weights)[:, None, None] * np.swapaxes(np.linalg.cholesky(links.informations), 1, 2)
         j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
-        error = residuals(poses, links)
-        for k, (a, b) in enumerate(links.ends):
-            add(roots[k] @ j_a[k], a)
-            add(roots[k] @ j_b[k], b)
-            errors.append(roots[k] @ error[k])
-            height += 3
-    shape = (height, 3 * len(poses))
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sp.csc_matrix(entries, shape=shape), np.concatenate(errors)
+        error = np.einsum("mij,mj->mi", roots, residuals(poses, links))
+        add(np.concatenate([roots @ j_a, roots @ j_b], axis=2), links.ends, error)
+    entries = (np.concatenate([np.zeros(0), *values]), (_whole(rows), _whole(columns)))
+    return sp.csc_matrix(entries, shape=(height, 3 * len(poses))), np.concatenate(errors)
+
+
+def _whole(parts: list[Ints]) -> Ints:
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Array, Ints, list[Array]]:
