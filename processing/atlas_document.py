@@ -13,6 +13,7 @@ from processing.edge_placement import Placed, Placement
 from processing.graph import Graph
 from processing.occupancy_grid import Grid
 from processing.pose_graph import marginal_covariances
+from processing.shared_errors import scale_errors
 from processing.trajectory import keyframe_poses, run_trajectory
 
 if TYPE_CHECKING:
@@ -130,11 +131,23 @@ def _arrays(piece: Placed, runs: list["DrivenRun"], grid: Grid) -> dict[str, NDA
         runs[span.run].run.scan_ticks[runs[span.run].loop.keyframes[path.keyframes]]
         for span, path in zip(solved.input.piece.spans, solved.input.paths, strict=True)
     ]
+    stamps_ns = [
+        runs[span.run].run.scans.stamps_ns[runs[span.run].loop.keyframes[path.keyframes]]
+        for span, path in zip(solved.input.piece.spans, solved.input.paths, strict=True)
+    ]
+    spans = solved.input.piece.spans
+    shared = scale_errors(
+        solved.map.links,
+        solved.map.firsts,
+        np.array([span.run for span in spans]),
+        np.array([runs[span.run].wheels.sigma for span in spans]),
+    )
     return {
         "poses": piece.edge_poses,
-        "covariances": marginal_covariances(piece.edge_poses, solved.map.links, solved.map.solution.weights),
+        "covariances": marginal_covariances(piece.edge_poses, solved.map.links, solved.map.solution.weights, shared),
         "path_firsts": solved.map.firsts,
         "ticks": np.concatenate(ticks),
+        "stamps_ns": np.concatenate(stamps_ns),
         "link_ends": solved.map.links.ends,
         "link_motions": solved.map.links.motions,
         "link_informations": solved.map.links.informations,

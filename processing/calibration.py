@@ -11,9 +11,11 @@ steering do not stay.
 
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from hw_profiles.profile import Profile
 from processing.geometry import accumulate, compose, inverse, relative
 from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
@@ -29,7 +31,10 @@ MAX_TURN_RAD = 0.3  # in a curve, arc and chord differ
 MIN_INLIERS = 0.8
 MAX_SIGMA_M = 0.02  # a match that knows the way less well says nothing of a percent
 PAIR_NOISE_M = 0.01  # what slip and roughness leave of one pair
+MEDIAN = 0.455  # of chi squared with one degree of freedom
 PRIOR = 0.02  # wheels err by so much, before anything is known
+AT_ONCE = 1.6  # pairs overlap and share their slip: so many of them count as one
+LEAST_NOISE = 0.25  # of the profile's: what wheels do where nobody sees them is not better known than that
 MAX_SIGMA = 0.003  # an estimate less sure than this is left alone
 
 
@@ -40,6 +45,7 @@ class WheelScale:
     scale: float
     sigma: float
     pairs: int
+    noise_m_per_sqrt_m: float  # what is left at random, by the square root of the way; NaN where nothing was seen
 
 
 def calibrate(run: Run) -> tuple[Run, WheelScale]:
@@ -53,7 +59,17 @@ def calibrate(run: Run) -> tuple[Run, WheelScale]:
     assert run.profile.vehicle is not None  # a run with wheels has a profile that explains them
     is_differential = run.profile.vehicle.kinematics == "differential"
     steering = found.scale if is_differential else 1.0  # both wheels of a differential drive roll; steering does not
-    return replace(run, wheels=run.wheels * np.array([found.scale, steering])), found
+    known = _with_noise(run.profile, found.noise_m_per_sqrt_m)
+    return replace(run, wheels=run.wheels * np.array([found.scale, steering]), profile=known), found
+
+
+def _with_noise(profile: Profile, noise_m_per_sqrt_m: float) -> Profile:
+    """The profile with the noise of the distance as it was seen, between its own and LEAST_NOISE of it."""
+    assert profile.vehicle is not None
+    noise = profile.vehicle.odometry_noise
+    known = float(np.clip(noise_m_per_sqrt_m / noise.distance_m_per_sqrt_m, LEAST_NOISE, 1.0))
+    noise = msgspec.structs.replace(noise, distance_m_per_sqrt_m=known * noise.distance_m_per_sqrt_m)
+    return msgspec.structs.replace(profile, vehicle=msgspec.structs.replace(profile.vehicle, odometry_noise=noise))
 
 
 def estimate_scale(run: Run) -> WheelScale:
@@ -96,4 +112,5 @@ def fit_scale(counted: Array, seen: Array, variances: Array) -> WheelScale:
         weights = counted**2 / variances / (1 + doubts / 4) ** 2  # Geman-McClure: a match that jumped is none
         information = PRIOR**-2 + float(weights.sum())
         scale = (PRIOR**-2 + float((weights / counted) @ seen)) / information
-    return WheelScale(float(scale), information**-0.5, len(counted))
+    noise = float(np.sqrt(np.median((seen - scale * counted) ** 2 / np.abs(counted)) / MEDIAN)) if len(seen) else np.nan
+    return WheelScale(float(scale), (information / AT_ONCE) ** -0.5 if len(seen) else PRIOR, len(counted), noise)

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from hw_profiles.errors import BadInputError
 from processing.atlas import read_document
+from processing.consistency import consistency, edge_errors
 from processing.evaluation import (
     Beacon,
     Trajectory,
@@ -58,6 +59,7 @@ def compare_truth(atlas: Path, truth: Path) -> dict[str, Any]:
         beacons, places, moves, _read_tags(truth / "tags.csv") if _has(truth, "tags.csv") else {}
     )
     walls = _compare_walls(atlas, truth / "walls.csv", runs, parts, moves) if _has(truth, "walls.csv") else None
+    stated = {run_id: (true[run_id].stamps_ns, true[run_id].poses) for run_id in runs}
     relatives = [relative_error(runs, distance_m) for distance_m in RELATIVE_DISTANCES_M]
     figures: dict[str, Any] = {
         "parts": len(moves),
@@ -68,6 +70,7 @@ def compare_truth(atlas: Path, truth: Path) -> dict[str, Any]:
         "beacon_error_m": _plain(distribution(np.array([error.error_m for error in at_beacons]))),
         "beacons": [asdict(error) for error in at_beacons],
         "edge_length_error_m": _plain(distribution(edge_length_errors(beacons, places, edges))),
+        "nees": _plain(consistency(edge_errors(atlas, document["edges"], stated))),
         "walls": _plain(walls),
     }
     return {"truth": figures}
@@ -107,6 +110,11 @@ def table(figures: dict[str, Any]) -> str:
         if away:  # no error: a beacon is the place on the road from which the tag was read
             rows.append(("  from beacon to tag", f"{np.mean(away):.2f} m in the mean, {max(away):.2f} m at most"))
         rows.append(("edge length error", _spread(truth["edge_length_error_m"], "edges")))
+        if nees := truth["nees"]:
+            band = (
+                f"3 were right; of {nees['edges']} edges {nees['band'][0]:.2f} to {nees['band'][1]:.2f} may be chance"
+            )
+            rows.append(("error² over covariance, NEES", f"{nees['mean_nees']:.2f} in the mean; {band}"))
         if walls := truth["walls"]:
             rows.append(("wall cells: precision", f"{walls['precision']:.4f} of {walls['occupied_cells']} drawn"))
             rows.append(("wall cells: recall", f"{walls['recall']:.4f} of {walls['seen_cells']} seen"))

@@ -21,7 +21,7 @@ from processing.pose_graph import Links
 from processing.registration import register_passes
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
-from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
+from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -155,7 +155,7 @@ def link_overlaps(
                 if worth_a_link(found, LOOP_INLIERS):
                     ends.append((boundary.add(int(p), i), boundary.add(q, int(k))))
                     motions.append(found.motion)
-                    informations.append(np.linalg.inv(found.covariance))
+                    informations.append(np.linalg.inv(blur(found.covariance)))
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 

@@ -15,7 +15,7 @@ from processing.geometry import compose, inverse, relative, transform, wrap_angl
 from processing.match_search import score
 from processing.pose_graph import Links
 from processing.scan_walls import Scan
-from processing.strong_links import KeyFrames, match_vehicles
+from processing.strong_links import KeyFrames, blur, match_vehicles
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -97,7 +97,7 @@ def relocate_stretch(
             continue
         ends.append((i, int(k)))
         motions.append(found.motion)
-        informations.append(np.linalg.inv(found.covariance))
+        informations.append(np.linalg.inv(blur(found.covariance)))
         shifts.append(compose(compose(poses[i], found.motion), inverse(poses[k])))
         worths.append(worth)
     if not shifts:

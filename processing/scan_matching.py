@@ -26,14 +26,13 @@ from processing.scan_walls import RANGE_NOISE_M, Scan
 Array = NDArray[np.float64]
 
 UNSEEN_VARIANCE = 1e4  # m², rad²: the match says nothing about this direction
-CORRELATION = 2.0  # neighbouring beams share roughness and calibration errors: so many of them count as one
 PRETENCE = 3.0  # information less than so many times what noisy normals pretend is none
 SETTLED = 0.05  # standard deviations: steps smaller than this do not matter
 MIN_MATCHED = 10  # points, and
 MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
 CLOSEST_M = 0.25  # pairs of points further apart than this are no pairs, once the guess has become good
 LEVER_M = 5.0  # a typical distance to the walls
-MODEL_NOISE_M = 0.002  # what matching on other points of a rough wall leaves, however many beams see it
+MODEL_NOISE_M = 0.001  # what matching on other points of a rough wall leaves, however many beams see it
 
 
 Matcher = Callable[[Scan, Scan, Array], ScanMatch]  # reference, current, first guess (3,)
@@ -192,7 +191,7 @@ def _gauss_newton(
                 for b in range(3):
                     false += v[a] * v[b] * false_information[a, b] * scale[a, b]
             seen = values[k] > PRETENCE * false and values[k] > 1e-3
-            variance = CORRELATION / (values[k] - false) + MODEL_NOISE_M * MODEL_NOISE_M if seen else UNSEEN_VARIANCE
+            variance = 1.0 / (values[k] - false) + MODEL_NOISE_M * MODEL_NOISE_M if seen else UNSEEN_VARIANCE
             if seen:
                 restless = max(restless, abs(pull / values[k]) / math.sqrt(variance))
             for a in range(3):

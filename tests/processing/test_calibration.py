@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.calibration import MAX_SIGMA, PRIOR, calibrate, estimate_scale, fit_scale, stride_pairs
+from processing.calibration import LEAST_NOISE, MAX_SIGMA, PRIOR, calibrate, estimate_scale, fit_scale, stride_pairs
 from processing.pipeline import DrivenRun
 
 
@@ -37,6 +37,15 @@ def test_fit_is_not_bent_by_matches_that_jumped() -> None:
     fitted = fit_scale(counted, seen, variances)
     assert fitted.scale == pytest.approx(1.013, abs=0.001)
     assert 0.0001 < fitted.sigma < 0.0005
+    assert 0.01 / 2 < fitted.noise_m_per_sqrt_m < 0.01  # 0.01 m in 2 to 4 m
+
+
+def test_the_noise_of_the_wheels_is_what_was_seen_within_reason(driven: list[DrivenRun]) -> None:
+    for of in driven:
+        assert of.run.profile.vehicle is not None
+        ours = of.run.profile.vehicle.odometry_noise.distance_m_per_sqrt_m
+        assert LEAST_NOISE * 0.02 <= ours < 0.012  # the profile says 0.02, its world 0.004
+        assert ours == pytest.approx(max(of.wheels.noise_m_per_sqrt_m, LEAST_NOISE * 0.02))
 
 
 def test_pairs_lie_their_stride_apart_all_along_the_way() -> None:
