@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import pytest
 
 from rtlog_server.devices.cia406.protocol import Frame
-from rtlog_server.devices.cia406.sdo import TRANSFER_TIMEOUT_S, NodeObjects, NodeSilentError, ObjectRefusedError, name
+from rtlog_server.devices.cia406.sdo import NodeObjects, NodeSilentError, ObjectRefusedError, name
 
 
 class Script:
@@ -72,7 +72,7 @@ def test_segments_without_an_end_are_cut_off() -> None:
     began = time.monotonic()
     with pytest.raises(NodeSilentError):
         Script(endless).objects.read_text((0x1008, 0))
-    assert time.monotonic() - began < TRANSFER_TIMEOUT_S + 10.0
+    assert time.monotonic() - began < 20.0
 
 
 def test_objects_are_named_as_manuals_do() -> None:
