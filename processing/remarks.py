@@ -6,8 +6,12 @@ In: the runs as they were mapped, and where their pieces lie. Out: lines for `bu
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from processing.beacons import Pass, overlapping_passes
 from processing.edge_placement import Placement
+
+GAP_S, GAP_M = 1.0, 2.0  # a scanner that is silent for longer, on a vehicle that drives on
 
 if TYPE_CHECKING:
     from processing.pipeline import DrivenRun
@@ -25,7 +29,17 @@ def remarks(runs: list["DrivenRun"], placed: Placement) -> list[str]:
         lost = int((~driven.loop.matched[1:]).sum())
         if lost:
             out.append(f"run {name}: {lost} of {len(driven.loop.matched)} scans follow odometry alone")
+        out += [f"run {name} {gap}" for gap in _gaps(driven)]
     return out + placed.remarks + _remark_parts(runs, placed)
+
+
+def _gaps(driven: "DrivenRun") -> list[str]:
+    """Where a run went on without a scan, as when a part of the recording is missing."""
+    seconds, moved = np.diff(driven.run.scans.times), np.hypot(*driven.loop.odometry.deltas[:, :2].T)
+    return [
+        f"moved {moved[k]:.1f} m in {seconds[k]:.1f} s without a scan after tick {int(driven.run.scan_ticks[k])}"
+        for k in np.flatnonzero((seconds > GAP_S) & (moved > GAP_M)).tolist()
+    ]
 
 
 def _overlaps(passes: list[Pass]) -> list[tuple[str, str]]:

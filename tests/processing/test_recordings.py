@@ -85,3 +85,10 @@ def test_a_split_run_is_mapped_as_the_whole_one(parts: list[Path], whole: Path) 
     for ours, theirs in zip(split.trajectories["small-back"], one.trajectories["small-back"], strict=True):
         assert np.array_equal(ours, theirs)
     assert split.document["edges"] == one.document["edges"]
+
+
+def test_a_missing_part_is_told(parts: list[Path]) -> None:
+    lost = build([parts[0], parts[2]], None, Config())
+    (gap,) = [line for line in lost.document["remarks"] if "without a scan" in line]
+    assert gap.startswith("run small-back moved 2")  # 10 s at 3 m/s at most
+    assert "m in 10.2 s without a scan after tick 99" in gap
