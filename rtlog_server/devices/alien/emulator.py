@@ -26,7 +26,7 @@ from rtlog_server.devices.pty_link import PtyLink
 
 CYCLE_S = 0.1  # a read cycle
 BACKLOG_LINES = 10_000  # kept while the stream is not open
-CUT_S = 0.002  # between the two pieces of what is cut
+CUT_S = 0.001  # between the two pieces of what is cut
 RESET_ON_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER
 
 
@@ -79,7 +79,11 @@ class Alr9650Emulator:
         self.cut = False
         self.swallow_push = False
         self.lacks = self._reader.lacks
-        self.power_on()
+        try:
+            self.power_on()
+        except OSError:
+            self.unplug()
+            raise
 
     def __enter__(self) -> "Alr9650Emulator":
         return self
