@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas_schema import check_document
-from processing.map_files import Overlay, write_map
-from processing.occupancy_grid import Grid, stitch, trim
+from processing.map_files import Overlay, stitch_image, write_map
+from processing.occupancy_grid import Grid
 from processing.tum import write_tum
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def _write_files(folder: Path, atlas: Atlas) -> None:
         np.savez_compressed(folder / "edges" / f"{name}.npz", allow_pickle=False, **arrays)
     for run_id, (stamps_ns, poses) in atlas.trajectories.items():
         write_tum(folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
-    write_map(folder, trim(stitch(atlas.grids, atlas.frames)), _overlay(atlas))
+    write_map(folder, stitch_image(atlas.grids, atlas.frames), _overlay(atlas))
     text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "atlas.json").write_text(text + "\n", encoding="utf-8")
 

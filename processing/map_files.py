@@ -14,13 +14,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hw_profiles.errors import BadInputError
 from processing.geometry import Array
-from processing.occupancy_grid import Grid
+from processing.occupancy_grid import Grid, stitch, stitched_window
 
 Image.MAX_IMAGE_PIXELS = None  # a mine of kilometres is no attack
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # pixels
 OCCUPIED_ABOVE = 1.0  # log-odds: more than a single hit
 FREE_BELOW = -0.3  # log-odds: one look is enough
 PICTURE_PIXELS = 1200, 4000  # the longer side of the picture: at least, at most (up to the whole factor)
+BAND_CELLS = 8_000_000  # that are stitched at once
 MARGIN_PIXELS = 50  # room for the scale bar and the names at the rim
 WALL, OPEN, DARK = (38, 38, 46), (255, 255, 255), (206, 208, 212)
 BLUE, RED, INK = (30, 100, 200), (205, 40, 30), (20, 20, 20)
@@ -56,13 +57,38 @@ def to_image(grid: Grid) -> MapImage:
     return MapImage(pixels, grid.resolution_m, grid.origin)
 
 
-def write_map(folder: Path, grid: Grid, overlay: Overlay | None = None) -> None:
-    """Write map.pgm, map.yaml and map.png into the folder, which exists; of a grid without cells, one unknown pixel."""
-    image = to_image(grid)
+def stitch_image(grids: Sequence[Grid], placements: Array) -> MapImage:
+    """`stitch` in three values, a band of rows after the other: a byte a cell, where log-odds take four and more.
+
+    Raises: ValueError: as `stitch`.
+    """
+    window = stitched_window(grids, placements)
+    pixels = np.full(window.shape, UNKNOWN, dtype=np.uint8)
+    known_rows, known_columns = np.zeros(window.shape[0], bool), np.zeros(window.shape[1], bool)
+    height = max(1, BAND_CELLS // max(1, window.shape[1]))
+    for first in range(0, window.shape[0], height):
+        some = slice(first, first + height)
+        band = stitch(grids, placements, window.rows(some))
+        pixels[some] = to_image(band).pixels
+        known = band.log_odds != 0
+        known_rows[some] = known.any(axis=1)
+        known_columns |= known.any(axis=0)
+    if not known_rows.any():
+        return MapImage(pixels, window.resolution_m, window.origin)
+    rows, columns = np.flatnonzero(known_rows), np.flatnonzero(known_columns)  # the rim of which nothing is known goes
+    origin = window.origin + window.resolution_m * np.array([columns[0], rows[0]])
+    return MapImage(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], window.resolution_m, origin)
+
+
+def write_map(folder: Path, image: MapImage, overlay: Overlay | None = None) -> None:
+    """Write map.pgm, map.yaml and map.png into the folder, which exists; of a map without cells, one unknown pixel."""
     if not image.pixels.size:
         image = MapImage(np.full((1, 1), UNKNOWN, dtype=np.uint8), image.resolution_m, image.origin)
     height, width = image.pixels.shape
-    (folder / "map.pgm").write_bytes(b"P5\n%d %d\n255\n" % (width, height) + image.pixels[::-1].tobytes())
+    with (folder / "map.pgm").open("wb") as file:
+        file.write(b"P5\n%d %d\n255\n" % (width, height))
+        for row in image.pixels[::-1]:
+            file.write(row.tobytes())
     x, y = (float(value) for value in np.round(image.origin, 6) + 0.0)
     (folder / "map.yaml").write_text(
         f"image: map.pgm\nmode: trinary\nresolution: {float(image.resolution_m)!r}\norigin: [{x!r}, {y!r}, 0.0]\n"

@@ -102,19 +102,41 @@ def _trace(
                 y += step_y
 
 
-def stitch(grids: Sequence[Grid], placements: Array) -> Grid:
-    """One grid of many: each placed by its pose in `placements` (k, 3), log-odds added, values in between interpolated.
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where in the plane the cells of a grid lie."""
 
-    Raises:
-        ValueError: there is no grid, or their resolutions differ.
-    """
+    shape: tuple[int, int]  # (H, W)
+    resolution_m: float
+    origin: Array  # (2,)
+
+    def rows(self, which: slice) -> "Window":
+        first, last, _ = which.indices(self.shape[0])
+        origin = self.origin + self.resolution_m * np.array([0, first])
+        return Window((last - first, self.shape[1]), self.resolution_m, origin)
+
+
+def stitched_window(grids: Sequence[Grid], placements: Array) -> Window:
+    """What the grids cover together. Raises: ValueError: there is no grid, or their resolutions differ."""
     if not grids or len(grids) != len(placements) or len({grid.resolution_m for grid in grids}) != 1:
         raise ValueError(f"{len(grids)} grids and {len(placements)} placements do not make one map of one resolution")
     resolution_m = grids[0].resolution_m
     corners = np.concatenate([_corners(grid, pose) for grid, pose in zip(grids, placements, strict=True)])
     low = np.floor(corners.min(axis=0) / resolution_m + 1e-6)
-    width, height = (np.ceil(corners.max(axis=0) / resolution_m - 1e-6) - low).astype(int)
-    whole = Grid(np.zeros((height, width), dtype=np.float32), resolution_m, low * resolution_m)
+    width, height = (np.ceil(corners.max(axis=0) / resolution_m - 1e-6) - low).astype(int).tolist()
+    return Window((height, width), resolution_m, low * resolution_m)
+
+
+def stitch(grids: Sequence[Grid], placements: Array, window: Window | None = None) -> Grid:
+    """One grid of many: each placed by its pose in `placements` (k, 3), log-odds added, values in between interpolated.
+
+    Of the whole, or of a window of it.
+
+    Raises:
+        ValueError: there is no grid, or their resolutions differ.
+    """
+    window = stitched_window(grids, placements) if window is None else window
+    whole = Grid(np.zeros(window.shape, dtype=np.float32), window.resolution_m, window.origin)
     for grid, pose in zip(grids, placements, strict=True):
         add_grid(whole, grid, pose)
     return whole
@@ -163,15 +185,6 @@ def _resample(
                     if 0 <= i < height and 0 <= j < width:
                         value += weight_x * weight_y * part[i, j]
             whole[row, column] += np.float32(value)
-
-
-def trim(grid: Grid) -> Grid:
-    """The grid without the rows and columns around it of which nothing is known."""
-    rows, columns = (np.flatnonzero(grid.log_odds.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return grid
-    origin = grid.origin + grid.resolution_m * np.array([columns[0], rows[0]])
-    return Grid(grid.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], grid.resolution_m, origin)
 
 
 def _corners(grid: Grid, pose: Array) -> Array:

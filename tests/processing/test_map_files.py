@@ -18,10 +18,11 @@ from processing.map_files import (
     Overlay,
     draw_map,
     read_map,
+    stitch_image,
     to_image,
     write_map,
 )
-from processing.occupancy_grid import Grid
+from processing.occupancy_grid import Grid, stitch
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def grid() -> Grid:
 
 
 def test_what_is_written_is_what_nav2_reads(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, grid)
+    write_map(tmp_path, to_image(grid))
     data = (tmp_path / "map.pgm").read_bytes()
     assert data.startswith(b"P5\n50 30\n255\n")
     assert len(data) == 13 + 50 * 30
@@ -45,7 +46,7 @@ def test_what_is_written_is_what_nav2_reads(tmp_path: Path, grid: Grid) -> None:
 
 
 def test_round_trip(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, grid)
+    write_map(tmp_path, to_image(grid))
     back = read_map(tmp_path)
     assert_array_equal(back.pixels, to_image(grid).pixels)
     assert (back.resolution_m, *back.origin) == (0.05, -1.25, 3.0)
@@ -61,13 +62,13 @@ def test_same_grid_same_bytes(tmp_path: Path, grid: Grid) -> None:
     )
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write_map(tmp_path / name, grid, overlay)
+        write_map(tmp_path / name, to_image(grid), overlay)
     for file in ("map.pgm", "map.yaml", "map.png"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
 def test_empty_grid_is_written(tmp_path: Path) -> None:
-    write_map(tmp_path, Grid(np.zeros((0, 0), dtype=np.float32), 0.05, np.zeros(2)))
+    write_map(tmp_path, to_image(Grid(np.zeros((0, 0), dtype=np.float32), 0.05, np.zeros(2))))
     assert read_map(tmp_path).pixels.tolist() == [[UNKNOWN]]
 
 
@@ -99,7 +100,7 @@ def test_nodes_are_drawn_where_they_are() -> None:
     ],
 )
 def test_bad_maps_are_refused(tmp_path: Path, grid: Grid, change: tuple[str, str], complaint: str) -> None:
-    write_map(tmp_path, grid)
+    write_map(tmp_path, to_image(grid))
     path = tmp_path / "map.yaml"
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(BadInputError, match=complaint):
@@ -107,7 +108,24 @@ def test_bad_maps_are_refused(tmp_path: Path, grid: Grid, change: tuple[str, str
 
 
 def test_damaged_image_is_refused(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, grid)
+    write_map(tmp_path, to_image(grid))
     (tmp_path / "map.pgm").write_bytes(b"P5\n50 30\n255\n\x00")
     with pytest.raises(BadInputError, match="map"):
         read_map(tmp_path)
+
+
+def test_a_map_stitched_in_bands_is_the_whole_without_its_empty_rim(
+    grid: Grid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placements = np.array([[0.0, 0.0, 0.0], [1.1, 0.6, 0.4]])
+    whole = to_image(stitch([grid, grid], placements))
+    known = np.argwhere(stitch([grid, grid], placements).log_odds != 0)
+    (low, left), (high, right) = known.min(axis=0), known.max(axis=0) + 1
+    assert left > 0
+    for cells in (10**6, 300, 1):
+        monkeypatch.setattr("processing.map_files.BAND_CELLS", cells)
+        image = stitch_image([grid, grid], placements)
+        assert_array_equal(image.pixels, whole.pixels[low:high, left:right])
+        assert_allclose(image.origin, whole.origin + 0.05 * np.array([left, low]))
+    nothing = Grid(np.zeros((4, 5), np.float32), 0.05, np.zeros(2))
+    assert np.all(stitch_image([nothing], placements[:1]).pixels == UNKNOWN)
