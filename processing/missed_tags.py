@@ -7,6 +7,7 @@ had, so that it can be cut there, and what it drove twice is one drift with one 
     this     ──i─────────────────k──      comes within NEAR_M of a pass of j, and the scans match: a pass without a read
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -43,20 +44,19 @@ class MappedRun:
 def find_missed(runs: Sequence[MappedRun], match: Matcher) -> list[list[Pass]]:
     """For each run the passes without a read, in driving order."""
     missed: list[list[Pass]] = [[] for _ in runs]
-    for epc in sorted({found.epc for run in runs for found in run.passes}):
-        places = [
-            (r, int(np.searchsorted(run.keyframes, found.centre)))
-            for r, run in enumerate(runs)
-            for found in run.passes
-            if found.epc == epc
-        ]
+    tracks = [_Track.of(run) for run in runs]
+    places: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for r, run in enumerate(runs):
+        for found in run.passes:
+            places[found.epc].append((r, int(np.searchsorted(run.keyframes, found.centre))))
+    for epc, of in sorted(places.items()):
         for r, run in enumerate(runs):
-            near = [place for place in places if runs[place[0]].part == run.part]
+            near = [(q, k) for q, k in of if runs[q].part == run.part]
             if near:
-                read = [k for q, k in places if q == r]
+                read = [k for q, k in of if q == r]
                 missed[r] += [
                     _silent_pass(epc, run, k)
-                    for k, place in _unread_visits(run, np.array([runs[q].poses[k] for q, k in near]), read)
+                    for k, place in tracks[r].unread_visits(np.array([runs[q].poses[k, :2] for q, k in near]), read)
                     if _sees_the_same(runs[near[place][0]], near[place][1], run, k, match)
                 ]
     return [sorted(of_run, key=lambda found: found.centre) for of_run in missed]
@@ -68,17 +68,31 @@ def add_passes(passes: Sequence[Pass], missed: Sequence[Pass]) -> list[Pass]:
     return sorted([*passes, *(found for found in missed if found.centre not in taken)], key=lambda found: found.centre)
 
 
-def _unread_visits(run: MappedRun, places: Array, read: list[int]) -> Iterator[tuple[int, int]]:
-    """The key frame nearest to a place, and that place, for every stay around the places (p, 3) without a read."""
-    distance, nearest = cKDTree(places[:, :2]).query(run.poses[:, :2], distance_upper_bound=AROUND_M)
-    around = np.flatnonzero(np.isfinite(distance))
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T)))
-    for stay in np.split(around, np.flatnonzero(np.diff(around) > 1) + 1):
-        if not len(stay) or any(stay[0] <= k <= stay[-1] for k in read):
-            continue
-        k = int(stay[np.argmin(distance[stay])])
-        if distance[k] < NEAR_M and END_M < way[k] < way[-1] - END_M:
-            yield k, int(nearest[k])
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Where a run drove, ready to be asked who came near: the work for a tag does not grow with the run."""
+
+    at: Array  # (K, 2)
+    way: Array  # (K,) m driven until there
+    tree: cKDTree
+
+    @staticmethod
+    def of(run: MappedRun) -> "_Track":
+        at = run.poses[:, :2]
+        return _Track(at, np.append(0.0, np.cumsum(np.hypot(*np.diff(at, axis=0).T))), cKDTree(at))
+
+    def unread_visits(self, places: Array, read: list[int]) -> Iterator[tuple[int, int]]:
+        """The key frame nearest to a place, and that place, for every stay around the places (p, 2) without a read."""
+        close = self.tree.query_ball_point(places, AROUND_M)
+        around = np.array(sorted({k for of_place in close for k in of_place}), np.int64)
+        apart = np.hypot(*np.moveaxis(self.at[around, None] - places, -1, 0))
+        for stay in np.split(np.arange(len(around)), np.flatnonzero(np.diff(around) > 1) + 1):
+            if not len(stay) or any(around[stay[0]] <= k <= around[stay[-1]] for k in read):
+                continue
+            nearest = int(stay[np.argmin(apart[stay].min(axis=1))])
+            k = int(around[nearest])
+            if apart[nearest].min() < NEAR_M and END_M < self.way[k] < self.way[-1] - END_M:
+                yield k, int(np.argmin(apart[nearest]))
 
 
 def _sees_the_same(reference: MappedRun, i: int, run: MappedRun, k: int, match: Matcher) -> bool:
