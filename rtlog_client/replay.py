@@ -12,6 +12,7 @@ Scans and tags come at their recorded stamps; the wheels turn evenly from one re
 start the vehicle stands still: its scanner sends the first scan again and again, as no scanner falls silent.
 """
 
+import heapq
 import logging
 import math
 import threading
@@ -19,7 +20,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ log = logging.getLogger(__name__)
 
 LEAD_S = 3.0  # a server that looks for its devices finds them within two
 TAIL_S = 0.5  # after the end, so that the last samples are still collected
+SHORTEST_NS, LONGEST_NS = 5_000_000, 100_000_000  # between two scans of a vehicle that stands still
 STANDING = -1  # Event.order of a scan before the start
 SCAN_AHEAD_NS = 20_000_000  # a scan is given to its emulator so long before the first ray
 DEFAULT_PERIOD_S = 0.1  # of recordings that do not say
@@ -70,7 +72,7 @@ def serve_devices(
     span = read_span(recording, start_s, duration_s)
     rate = rate or recorded_period_s(recording) / profile.tick_period_s
     lasers = list(addressed_lasers(profile))
-    first_scans = [_first_scan(recording, name, span) for name in lasers]
+    standing = [_standing_still(recording, name, span, round(lead_s * rate * 1e9)) for name in lasers]
     track = read_encoder_track(recording, profile) if profile.encoder_bus is not None else None
     events = read_events(recording, [*lasers, *(["rfid"] if profile.rfid is not None else [])], span)
 
@@ -88,8 +90,7 @@ def serve_devices(
         log.info("standing still for %g s, then %.1f s of drive at %g times its speed", lead_s, length_s, rate)
         player = FaultPlayer(faults, stage.lines, report.host_ns(span.start_ns) - utc_ns, utc_ns)
         stack.callback(player.close)
-        standing = _standing_still(first_scans, math.ceil(lead_s / profile.tick_period_s), profile.tick_period_s * rate)
-        counts = _play(chain(standing, events), stage, report, utc_ns, stopping)
+        counts = _play(chain(heapq.merge(*standing), events), stage, report, utc_ns, stopping)
         stopping.wait(max(0.0, (report.host_ns(span.end_ns) - utc_ns - time.monotonic_ns()) * 1e-9) + TAIL_S)
     scans, unheard, reads = counts
     return replace(
@@ -111,18 +112,15 @@ def _timeline(span: Span, earliest_ns: int, period_s: float, rate: float) -> Rep
     return ReplayReport(start_ns - span.start_ns, span.start_ns, span.end_ns, 0, 0, 0, rate)
 
 
-def _first_scan(recording: Path, device: str, span: Span) -> Event:
-    scan = next(read_events(recording, [device], span), None)
-    if scan is None:
+def _standing_still(recording: Path, device: str, span: Span, lead_ns: int) -> list[Event]:
+    """The first scan again and again for so long before it, as far apart as it and the next."""
+    first_two = list(islice(read_events(recording, [device], span), 2))
+    if not first_two:
         raise BadInputError(f"{recording}: no scan of {device} in the part to replay, and the profile has that laser")
-    return scan
-
-
-def _standing_still(first_scans: list[Event], ticks: int, spacing_s: float) -> Iterator[Event]:
-    """The first scan of each laser, once for each tick before it."""
-    for ahead in range(ticks, 0, -1):
-        for scan in sorted(first_scans):
-            yield Event(scan.stamp_ns - round(ahead * spacing_s * 1e9), STANDING, scan.device, scan.content)
+    first, apart_ns = first_two[0], first_two[-1].stamp_ns - first_two[0].stamp_ns
+    apart_ns = apart_ns if SHORTEST_NS <= apart_ns <= LONGEST_NS else LONGEST_NS
+    count = math.ceil(lead_ns / apart_ns)
+    return [Event(first.stamp_ns - k * apart_ns, STANDING, device, first.content) for k in range(count, 0, -1)]
 
 
 def _play(

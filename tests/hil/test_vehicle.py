@@ -51,7 +51,7 @@ def messages(path: Path, topic: Any) -> list[tuple[int, Any]]:
 
 def test_every_device_is_found_and_says_who_it_is(checked: Any) -> None:
     status, devices = checked
-    assert status == 0, devices
+    assert status == 0, [d for d in devices if not d["well"]]
     assert {device["device"] for device in devices} >= {"laser/primary"}
 
 
