@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from processing.beacons import Pass
 from processing.edge_placement import Placement
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
@@ -19,35 +20,57 @@ from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
 from processing.trajectory import keyframe_poses
 
+REACH_M = 20.0  # from the middle of a cloud to its ends; no reader of passive tags reaches as far
+RIDES = "it was read on and on over more way than a reader reaches: it rides along"
+MOVED = "by its distance to other tags it was read at more than one place: moved, or two tags of one EPC"
+
 if TYPE_CHECKING:
     from processing.pipeline import DrivenRun
 
 
 def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[dict[str, Any]]]:
-    """The runs without the passes of tags that were moved or stand at two places, and what to tell of these."""
+    """The runs without the passes of tags that are at no one place, and what to tell of these."""
+    riding = {found.epc for run in runs for found in _passed_on_and_on(run)}
+    staying = _without(runs, riding)
 
     def scan_of(of: PassId) -> Scan:
-        loop = runs[of[0]].loop
-        return loop.scans[int(np.searchsorted(loop.keyframes, runs[of[0]].passes[of[1]].centre))]
+        loop = staying[of[0]].loop
+        return loop.scans[int(np.searchsorted(loop.keyframes, staying[of[0]].passes[of[1]].centre))]
 
     @cache
     def same_walls(first: PassId, second: PassId) -> bool:
-        found = register_passes(scan_of(first), scan_of(second), mount_pose(runs[first[0]].run))
+        found = register_passes(scan_of(first), scan_of(second), mount_pose(staying[first[0]].run))
         return found is not None and bool(np.linalg.eigvalsh(found.covariance[:2, :2])[-1] < SEEN_M**2)
 
-    moved = find_moved([_open_passes(run) for run in runs], same_walls)
+    moved = find_moved([_open_passes(run) for run in staying], same_walls)
+    reasons = dict.fromkeys(riding, RIDES) | dict.fromkeys(moved, MOVED)
     left_out = [
         {
             "what": f"tag {epc}",
             "run": run.run.run_id,
             "ticks": [int(run.run.scan_ticks[found.centre]) for found in run.passes if found.epc == epc],
-            "reason": "by its distance to other tags it was read at more than one place: moved, or two tags of one EPC",
+            "reason": reason,
         }
-        for epc in moved
+        for epc, reason in sorted(reasons.items())
         for run in runs
         if any(found.epc == epc for found in run.passes)
     ]
-    return [replace(run, passes=[found for found in run.passes if found.epc not in moved]) for run in runs], left_out
+    return _without(staying, set(moved)), left_out
+
+
+def _without(runs: list["DrivenRun"], epcs: set[str]) -> list["DrivenRun"]:
+    return [replace(run, passes=[found for found in run.passes if found.epc not in epcs]) for run in runs]
+
+
+def _passed_on_and_on(driven: "DrivenRun") -> list[Pass]:
+    """Passes that are none: the tag was read without a break at places too far from each other."""
+    at, keyframes = driven.loop.keyframe_poses[:, :2], driven.loop.keyframes
+    out = []
+    for found in driven.passes:
+        first, centre, last = np.searchsorted(keyframes, [found.first, found.centre, found.last])
+        if np.hypot(*(at[first : last + 1] - at[centre]).T).max(initial=0.0) > REACH_M:
+            out.append(found)
+    return out
 
 
 def _open_passes(driven: "DrivenRun") -> OpenPasses:

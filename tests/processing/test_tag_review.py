@@ -36,3 +36,12 @@ def test_one_epc_at_two_places_is_left_out(driven: list[DrivenRun], swapped: boo
         assert "moved, or two tags of one EPC" in item["reason"]
     assert sorted({found.epc[-3:] for run in runs for found in run.passes}) == ["401", "402", "403"]
     assert [len(run.passes) for run in runs] == ([2, 5] if swapped else [5, 2])
+
+
+def test_a_tag_that_rides_along_is_no_beacon(driven: list[DrivenRun]) -> None:
+    epc, count = "E200000000000000000000FF", len(driven[0].loop)
+    rider = Pass(epc, driven[0].loop.keyframes[50], 0, count - 1, 0.0, 0.0, 10.0)
+    runs, left_out = leave_out_moved([replace(driven[0], passes=[rider, *driven[0].passes]), driven[1]])
+    assert [(item["what"], item["run"]) for item in left_out] == [(f"tag {epc}", "small-around")]
+    assert left_out[0]["reason"].endswith("it rides along")
+    assert [run.passes for run in runs] == [run.passes for run in driven]
