@@ -23,7 +23,7 @@ from rtlog_server.devices.alien.listener import PushListener
 from rtlog_server.devices.alien.protocol import AlienError
 from rtlog_server.devices.alien.setup import Setup, set_up
 from rtlog_server.devices.alien.tag_line import parse_tag
-from rtlog_server.devices.alien.tag_memory import ReaderClock, TagMemory
+from rtlog_server.devices.alien.tag_memory import TagMemory
 from rtlog_server.devices.device import Device, DeviceError
 from rtlog_server.devices.rfid import TagSample
 
@@ -63,7 +63,8 @@ class Alr9650(Device[TagSample]):
         self._selector = selectors.DefaultSelector()
         self._push_address = self._listen(console, self._selector)
         self._setup = set_up(console, self._push_address)
-        self._memory.clock = ReaderClock()  # a clock set anew, to whole seconds, has another offset from ours
+        # Its list was cleared, so its counts begin anew; and a clock set anew, to whole seconds, is off otherwise.
+        self._memory = TagMemory()
         self._selector.register(console.link, selectors.EVENT_READ)
         self._awaiting_reply, self._last_list, self._overtaken = False, [], 0
         self._asked_at, self._checked_at = 0.0, time.monotonic()
