@@ -16,6 +16,10 @@ def test_requests_are_command_and_address_nibble() -> None:
     assert protocol.fast_baud_request() == b"\xff\x0f\x00"
 
 
+def test_a_strobe_goes_to_all_encoders() -> None:
+    assert protocol.strobe_request() == b"\x4f"
+
+
 @pytest.mark.parametrize(
     ("reply", "multi_turn", "counts"),
     [
