@@ -24,6 +24,7 @@ from hw_profiles.profile import Encoder
 MAX_SPEED_M_S = 5.0  # of a wheel whose speed is not known yet
 MAX_ACCELERATION_M_S2 = 5.0  # more than loose ground lets any wheel brake by; one that spins on it comes out doubtful
 MARGIN_TURNS = 0.1  # what the jitter of stamps and speed may add to a movement
+MIN_SPEED_AGE_NS = 20_000_000  # over a shorter time the jitter of stamps is most of the speed
 MAX_SPEED_AGE_NS = 500_000_000  # over a longer gap two readings tell no speed
 
 
@@ -100,7 +101,8 @@ class TurnCounter:
             total = nearest_total(raw, self._counts_per_turn, last)
             self._lost = (total - raw) % self._modulus
         elapsed_s = (latched_ns - last_ns) * 1e-9
-        known = 0 < latched_ns - last_ns <= MAX_SPEED_AGE_NS
+        # A doubtful movement tells no speed: the prediction would go on with it for ever, a whole turn too fast.
+        known = not doubtful and MIN_SPEED_AGE_NS <= latched_ns - last_ns <= MAX_SPEED_AGE_NS
         self._rate = (total - last) / elapsed_s if known else None
         self._last = total, latched_ns
         return total, doubtful

@@ -1,6 +1,7 @@
 """Counting on over many turns, and the angles that JointState tells."""
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -121,3 +122,17 @@ def test_angles_have_the_sign_that_the_profile_says() -> None:
     assert position_rad(backward, 3 * COUNTS) == pytest.approx(-6 * math.pi)
     assert counts_at(backward, -math.pi) == COUNTS // 2
     assert counts_at(backward, 6 * math.pi) == -3 * COUNTS
+
+
+@pytest.mark.parametrize("late_ns", [1_000_000, 60_000_000, 100_000_000])
+@pytest.mark.parametrize("wrong_rad", [-2.5, -1.7, 1.7, 2.5])
+def test_a_wrong_answer_does_not_set_a_wheel_turning_for_ever(wrong_rad: float, late_ns: int) -> None:
+    counter = TurnCounter(COUNTS, COUNTS, RADIUS_M)
+    per_tick = 260  # 4 rad/s
+    for tick in range(10):
+        counter.count(tick * per_tick % COUNTS, tick * TICK_NS)
+    wrong = round(9 * per_tick + wrong_rad / math.tau * COUNTS) % COUNTS
+    counter.count(wrong, 9 * TICK_NS + late_ns)  # another encoder's, or noise
+    totals = [counter.count(tick * per_tick % COUNTS, tick * TICK_NS)[0] for tick in range(11, 30)]
+    assert {b - a for a, b in pairwise(totals)} == {per_tick}
+    assert abs(totals[-1] - 29 * per_tick) <= COUNTS
