@@ -65,7 +65,7 @@ class Tag(Record, frozen=True):
     read_range_m: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
     read_probability: Probability = 0.6  # of one inventory round within the range; outside it is zero
     unread_by: list[str] = field(default_factory=list)  # runs that never read it
-    from_s: Annotated[float, Meta(ge=0.0)] = 0.0  # of each run: when the tag is put there
+    from_s: float = -math.inf  # of each run: when the tag is put there
     until_s: float = math.inf  # and taken away
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from hw_profiles.profile import Mount, Profile, load_profile, parse_profile, read_profile_text
@@ -164,6 +165,16 @@ def test_reads_are_as_probable_as_the_tag_says() -> None:
     shy = Tag(epc=TAG.epc, at=(0.0, 0.0), read_range_m=15.0, read_probability=0.3)
     _, readings = reads([shy], [(20.0, 0.0)])
     assert sum(reading.count for reading in readings) == pytest.approx(0.3 * 375, rel=0.2)
+
+
+def test_a_tag_is_read_while_it_is_there() -> None:
+    """Past x = 20 m at 10 s; put up a little after, or taken away a little before."""
+    before, after = replace(TAG, until_s=9.9), replace(TAG, from_s=10.1)
+    _, readings = reads([before, after], [(20.0, 1.0)] * 2)
+    times = [reading.time_s for reading in readings]
+    assert any(time < 9.9 for time in times)
+    assert any(time > 10.1 for time in times)
+    assert not any(9.9 < time < 10.1 for time in times)
 
 
 def test_passes_are_missed_as_often_as_asked() -> None:
