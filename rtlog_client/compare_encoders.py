@@ -98,13 +98,13 @@ class _Wheel:
         off = round((angle_rad - around[2]) / math.tau)
         if self._turns_off is None:
             self._turns_off = off
-        turned, self._turns_off = off - self._turns_off, off
         error = angle_rad - math.tau * off
         outside = max(min(around) - slack - error, error - max(around) - slack, 0.0)
         self._worst_rad = max(self._worst_rad, abs(error - around[2]))
         if outside > 0:
             self.detail = f"{error - around[2]:+.4f} rad off the track"
             return "changed"
+        turned, self._turns_off = off - self._turns_off, off
         if turned and self._encoder.role != "steering":
             self.detail = f"{turned:+d} turns"
             return "turns"
