@@ -1,7 +1,8 @@
 """Build an hour of one recording (36,000 ticks, 541 beams): time against real time, with one job and two, and memory.
 
 All in: starting Python, reading, mapping, writing. What is held against real time is the CPU time of the one process,
-which is its wall time on a machine that does nothing else. The hour is simulated at the first run and kept in the temporary folder.
+which is its wall time on a machine that does nothing else. The hour is simulated at the first run and kept in the
+temporary folder.
 """
 
 import sys
@@ -12,6 +13,7 @@ from building import build, network, same_atlas
 from table import Figure, report
 
 from rtlog_client.log_file import read_info
+from rtlog_server.topics import TICK
 
 BLOCKS = 6  # 6.7 km of drifts
 TICK_S = 0.1
@@ -20,7 +22,7 @@ LEAST_RATE, LEAST_GAIN = 100.0, 1.7
 
 def main() -> int:
     recordings = network(BLOCKS, one_run=True)
-    seconds = TICK_S * sum(read_info(path).message_counts["/tick"] for path in recordings)
+    seconds = TICK_S * sum(read_info(path).message_counts[TICK.name] for path in recordings)
     with tempfile.TemporaryDirectory() as folder:
         one_atlas, two_atlas = Path(folder) / "one.atlas", Path(folder) / "two.atlas"
         one, two = build(recordings, one_atlas), build(recordings, two_atlas, "--jobs", "2")
