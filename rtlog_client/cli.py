@@ -27,7 +27,6 @@ from rtlog_client.replay import NO_FAULTS, serve_devices
 from rtlog_client.replay_capture import serve_capture
 from rtlog_client.replay_report import load_report
 from rtlog_client.republish import republish
-from rtlog_server.realtime import become_realtime
 
 DEVICE_HELP = "RUN is a captured byte stream of this scanner, as laser/primary; its very bytes are sent"
 RATE_HELP = "so many times as fast, or max: one recorded tick for each tick of the profile; default: 1"
@@ -165,7 +164,6 @@ def _replay(args: argparse.Namespace) -> None:
     faults = load_faults(args.faults) if args.faults is not None else NO_FAULTS
     stopping, part = _stop_on_signals(), {"start_s": args.start, "duration_s": args.duration}
     if args.to == "devices":
-        become_realtime()  # before the emulators' threads: a device does not wait for this machine's other work
         more = {"rate": args.rate, "faults": faults}
         if args.device is not None:
             if args.start or args.duration:

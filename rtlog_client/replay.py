@@ -32,7 +32,7 @@ from rtlog_client.fault_player import FaultPlayer
 from rtlog_client.faults import FaultScript, check_devices
 from rtlog_client.log_file import read_info
 from rtlog_client.replay_report import ReplayReport
-from rtlog_client.stage import Stage, addressed_devices, addressed_lasers
+from rtlog_client.stage import Stage, addressed_devices, addressed_lasers, ask_realtime
 from rtlog_client.stalls import StallWatch
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.ticker import utc_offset_ns
@@ -76,6 +76,7 @@ def serve_devices(
     track = read_encoder_track(recording, profile) if profile.encoder_bus is not None else None
     events = read_events(recording, [*lasers, *(["rfid"] if profile.rfid is not None else [])], span)
 
+    ask_realtime()
     utc_ns = utc_offset_ns()
     report = _timeline(span, time.monotonic_ns() + utc_ns + round(lead_s * 1e9), profile.tick_period_s, rate)
 

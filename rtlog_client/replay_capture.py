@@ -20,7 +20,7 @@ from rtlog_client.capture import read_capture
 from rtlog_client.fault_player import FaultPlayer
 from rtlog_client.faults import FaultScript, check_devices
 from rtlog_client.replay_report import ReplayReport
-from rtlog_client.stage import Stage, addressed_lasers
+from rtlog_client.stage import Stage, addressed_lasers, ask_realtime
 from rtlog_client.stalls import StallWatch
 from rtlog_server.ticker import utc_offset_ns
 
@@ -48,6 +48,7 @@ def serve_capture(
     check_devices(faults, [device], profile.name)
     capture = read_capture(path)
     alone = _alone(profile, device)
+    ask_realtime()
     utc_ns = utc_offset_ns()
     with ExitStack() as stack:
         watch = stack.enter_context(StallWatch(utc_ns))

@@ -4,6 +4,7 @@ In: a profile, what the encoders showed, the devices whose wires a fault script 
 and tag reads are given. A device without faults stands at its address itself; one with faults behind a `Wire` there.
 """
 
+import logging
 import math
 import socket
 import tempfile
@@ -26,6 +27,9 @@ from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.devices.encoders import counts_at
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
+from rtlog_server.realtime import become_realtime
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from rtlog_server.devices.cia406.emulator import CanBusEmulator
@@ -182,6 +186,11 @@ class Stage:
     def _hidden(self, name: str) -> Path:
         """Where an emulator's terminal stands behind its wire."""
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="rtlog-"))) / name
+
+
+def ask_realtime() -> None:
+    """Before a stage is opened, whose threads inherit it: a device does not wait for this machine's other work."""
+    log.info("real time: %s", "; ".join(f"{key} {answer}" for key, answer in become_realtime().items()))
 
 
 @contextmanager
