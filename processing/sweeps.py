@@ -110,11 +110,6 @@ class StoredScans(Sequence[Scan]):
     def __iter__(self) -> Iterator[Scan]:
         return self.sweeps.scans(self.rows)
 
-    def detached(self) -> "StoredScans":
-        """The same without the sweeps before and after them: less to carry to another process."""
-        first, last = int(self.rows[0]), int(self.rows[-1])
-        return StoredScans(self.sweeps.cut(first, last), self.rows - first)
-
 
 @njit(cache=True)
 def _straighten(
