@@ -5,8 +5,7 @@ way: a worn tyre, a wrong radius in the profile. Where the walls are rough, or a
 how far the vehicle really went; what is learnt there is carried into the drifts where the laser sees nothing along
 the way.
 
-Only the scale of the distance is estimated: headings are seen by the laser in every drift, so errors of track width and
-steering do not stay.
+What they say wrongly about turns is `turn_calibration`'s.
 """
 
 from dataclasses import dataclass, replace
@@ -16,18 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import Profile
-from processing.geometry import accumulate, compose, inverse, relative
+from processing.geometry import accumulate, compose, inverse, relative, wrap_angle
 from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.scan_matching import match_scans
 from processing.sweeps import sweeps_of
+from processing.turn_calibration import WheelTurn, fit_turn, put_right
 
 Array = NDArray[np.float64]
 
 STRIDES_M = (2.0, 4.0)  # between two scans that are compared
 MAX_PAIRS = 400  # of each stride
 MAX_TURN_RAD = 0.3  # in a curve, arc and chord differ
+MOST_TURN_RAD = 1.0  # beyond, a scanner sees too little twice
+WHEELS_M = 0.05  # how well the wheels know a few metres, where the walls do not show them
 MIN_INLIERS = 0.8
 MAX_SIGMA_M = 0.02  # a match that knows the way less well says nothing of a percent
 PAIR_NOISE_M = 0.01  # what slip and roughness leave of one pair
@@ -48,49 +50,79 @@ class WheelScale:
     noise_m_per_sqrt_m: float  # what is left at random, by the square root of the way; NaN where nothing was seen
 
 
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """k pairs of scans that match."""
+
+    counted: Array  # (k, 3) motions of the vehicle by its wheels
+    seen: Array  # (k, 3) by the matches
+    covariances: Array  # (k, 3, 3) of those
+
+
 def calibrate(run: Run) -> tuple[Run, WheelScale]:
-    """The run with its distances as the laser sees them; as it was, with scale 1, where the laser sees too little."""
-    found = estimate_scale(run)
+    """The run with its wheels as the laser sees them; its distances as they were where the laser sees too little."""
+    pairs = measure_pairs(run)
+    found = scale_of(pairs)
     if found.sigma > MAX_SIGMA:
-        return run, replace(found, scale=1.0)
+        found = replace(found, scale=1.0)
     if run.odometry is not None:
         return replace(run, odometry=run.odometry * np.array([found.scale, found.scale, 1.0])), found
     assert run.wheels is not None
-    assert run.profile.vehicle is not None  # a run with wheels has a profile that explains them
-    is_differential = run.profile.vehicle.kinematics == "differential"
-    steering = found.scale if is_differential else 1.0  # both wheels of a differential drive roll; steering does not
-    known = _with_noise(run.profile, found.noise_m_per_sqrt_m)
-    return replace(run, wheels=run.wheels * np.array([found.scale, steering]), profile=known), found
+    profile, wheels = put_right(run.profile, run.wheels, found.scale, turn_of(pairs))
+    if found.sigma <= MAX_SIGMA:
+        profile = _with_noise(profile, found.noise_m_per_sqrt_m)
+    return replace(run, wheels=wheels, profile=profile), found
 
 
 def _with_noise(profile: Profile, noise_m_per_sqrt_m: float) -> Profile:
     """The profile with the noise of the distance as it was seen, between its own and LEAST_NOISE of it."""
     assert profile.vehicle is not None
     noise = profile.vehicle.odometry_noise
-    known = float(np.clip(noise_m_per_sqrt_m / noise.distance_m_per_sqrt_m, LEAST_NOISE, 1.0))
-    noise = msgspec.structs.replace(noise, distance_m_per_sqrt_m=known * noise.distance_m_per_sqrt_m)
+    most = noise.distance_m_per_sqrt_m
+    noise = msgspec.structs.replace(
+        noise, distance_m_per_sqrt_m=float(np.clip(noise_m_per_sqrt_m, LEAST_NOISE * most, most))
+    )
     return msgspec.structs.replace(profile, vehicle=msgspec.structs.replace(profile.vehicle, odometry_noise=noise))
 
 
-def estimate_scale(run: Run) -> WheelScale:
-    """Compare what the wheels count over a few metres with what scan matches see of it."""
+def measure_pairs(run: Run) -> Pairs:
+    """What the wheels count over a few metres, and what scan matches see of it."""
     odometry, mount = odometry_at_scans(run), mount_pose(run)
     sweeps = sweeps_of(run.scans, odometry, mount)
     driven = accumulate(np.zeros(3), odometry.deltas)
     way = np.append(0.0, np.cumsum(np.hypot(*odometry.deltas[:, :2].T)))
-    counted, seen, variances = [], [], []
+    counted, seen, covariances = [], [], []
     for first, last in stride_pairs(way):
         guess = relative(driven[first], driven[last])
-        if abs(guess[2]) > MAX_TURN_RAD or abs(guess[0]) < 0.5 * (way[last] - way[first]):
+        if abs(guess[2]) > MOST_TURN_RAD or abs(guess[0]) < 0.5 * (way[last] - way[first]):
             continue
         one, other = sweeps.scan(first), sweeps.scan(last)
         match = match_scans(one, other, compose(inverse(mount), compose(guess, mount)))
         motion, covariance = through_mount(mount, match.motion, match.covariance)
-        if match.converged and match.inliers >= MIN_INLIERS and covariance[0, 0] < MAX_SIGMA_M**2:
-            counted.append(guess[0])
-            seen.append(motion[0])
-            variances.append(covariance[0, 0] + PAIR_NOISE_M**2)
-    return fit_scale(np.array(counted), np.array(seen), np.array(variances))
+        if match.converged and match.inliers >= MIN_INLIERS:
+            counted.append(guess)
+            seen.append(motion)
+            covariances.append(covariance)
+    return Pairs(
+        np.array(counted).reshape(-1, 3), np.array(seen).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
+    )
+
+
+def scale_of(pairs: Pairs) -> WheelScale:
+    """From the pairs that drive straight on and whose walls show the way."""
+    straight = np.abs(pairs.counted[:, 2]) <= MAX_TURN_RAD
+    used = straight & (pairs.covariances[:, 0, 0] < MAX_SIGMA_M**2)
+    variances = pairs.covariances[used, 0, 0] + PAIR_NOISE_M**2
+    return fit_scale(pairs.counted[used, 0], pairs.seen[used, 0], variances)
+
+
+def turn_of(pairs: Pairs) -> WheelTurn:
+    """From all pairs: smooth walls show headings too, once the wheels say how far it was."""
+    known = np.linalg.inv(np.linalg.inv(pairs.covariances) + np.diag([WHEELS_M**-2, 0.0, 0.0]))
+    change = wrap_angle(pairs.seen[:, 2] - pairs.counted[:, 2])
+    half = pairs.counted[:, 2] / 2
+    ahead_m = pairs.counted[:, 0] / np.cos(half) / np.sinc(half / np.pi)  # the arc over its chord
+    return fit_turn(pairs.counted[:, 2], ahead_m, pairs.counted[:, 2] + change, known[:, 2, 2])
 
 
 def stride_pairs(way: Array) -> list[tuple[int, int]]:

@@ -2,8 +2,18 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from processing.calibration import LEAST_NOISE, MAX_SIGMA, PRIOR, calibrate, estimate_scale, fit_scale, stride_pairs
+from processing.calibration import (
+    LEAST_NOISE,
+    MAX_SIGMA,
+    PRIOR,
+    calibrate,
+    fit_scale,
+    measure_pairs,
+    scale_of,
+    stride_pairs,
+)
 from processing.pipeline import DrivenRun
 
 
@@ -11,7 +21,9 @@ def test_the_small_mine_shows_that_its_wheels_count_too_little(driven: list[Driv
     for of in driven:  # its world has wheels that are 1.0 and 0.8 % larger than the profile says
         assert of.wheels.scale == pytest.approx(1.009, abs=0.002)
         assert of.wheels.sigma < 0.001
-        assert estimate_scale(of.run).scale == pytest.approx(1.0, abs=0.001)  # put right, nothing is left to put right
+        assert scale_of(measure_pairs(of.run)).scale == pytest.approx(
+            1.0, abs=0.001
+        )  # put right, nothing is left to put right
 
 
 def test_perfect_wheels_stay_as_they_are(driven_clean: list[DrivenRun]) -> None:
@@ -22,7 +34,10 @@ def test_perfect_wheels_stay_as_they_are(driven_clean: list[DrivenRun]) -> None:
 def test_too_little_seen_changes_nothing(driven: list[DrivenRun], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("processing.calibration.MIN_INLIERS", 1.1)  # as if no match were good enough
     run, wheels = calibrate(driven[0].run)
-    assert run is driven[0].run
+    assert run.wheels is not None
+    assert driven[0].run.wheels is not None
+    assert_allclose(run.wheels, driven[0].run.wheels)
+    assert run.profile == driven[0].run.profile
     assert (wheels.scale, wheels.pairs) == (1.0, 0)
     assert wheels.sigma == pytest.approx(PRIOR)
     assert wheels.sigma > MAX_SIGMA
