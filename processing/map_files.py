@@ -164,9 +164,11 @@ def _shrink(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
         return pixels
     pad = [(0, -size % factor) for size in pixels.shape]
     height, width = (size + more[1] for size, more in zip(pixels.shape, pad, strict=True))
-    blocks = np.pad(pixels, pad, constant_values=UNKNOWN).reshape(height // factor, factor, width // factor, factor)
-    lowest, highest = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
-    return np.where(lowest == OCCUPIED, lowest, highest)
+    rows = np.pad(pixels, pad, constant_values=UNKNOWN).reshape(height // factor, factor, width)
+    lowest, highest = (  # rows first: whole lines of pixels at once
+        of.reshape(height // factor, width // factor, factor) for of in (rows.min(axis=1), rows.max(axis=1))
+    )
+    return np.where(lowest.min(axis=2) == OCCUPIED, np.uint8(OCCUPIED), highest.max(axis=2))
 
 
 def _draw_scale_bar(
