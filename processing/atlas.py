@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,12 +76,20 @@ def _write_files(folder: Path, atlas: Atlas) -> None:
     (folder / "edges").mkdir()
     (folder / "trajectories").mkdir()
     for name, arrays in atlas.edges.items():
-        np.savez_compressed(folder / "edges" / f"{name}.npz", allow_pickle=False, **arrays)
+        _write_npz(folder / "edges" / f"{name}.npz", arrays)
     for run_id, (stamps_ns, poses) in atlas.trajectories.items():
         write_tum(folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
     write_map(folder, stitch_image(atlas.grids, atlas.frames), _overlay(atlas))
     text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "atlas.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """As numpy's savez_compressed, which knows only the slow way to compress."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
 
 
 def read_document(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ In: key frames with their scans and the poses so far. Out: links. Two kinds of p
               ●──●──●──●
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,7 +85,7 @@ def blur(covariance: Array) -> Array:
     The direction that a match leaves open comes from noisy walls, and is off by milliradians. Over the metres that two
     drives may be off along a smooth drift, that pretends to see them, and many such links would add up to a lie.
     """
-    if np.linalg.eigvalsh(covariance[:2, :2])[-1] < UNSEEN_M**2:
+    if extreme_variances(covariance)[1] < UNSEEN_M**2:
         return covariance
     return covariance + np.diag([TILT_M**2, TILT_M**2, TILT_RAD**2])
 
@@ -107,9 +108,18 @@ def match_vehicles(
     return replace(found, motion=motion, covariance=covariance)
 
 
+def extreme_variances(covariance: Array) -> tuple[float, float]:
+    """Of the position, in the direction that is known best and in the one that is known worst: the eigenvalues of the
+    upper left (2, 2) of a covariance (3, 3).
+    """
+    (xx, xy, _), (_, yy, _), _ = covariance.tolist()
+    middle, root = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    return middle - root, middle + root
+
+
 def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
     """Do the scans match well, and say something?"""
-    seen = np.linalg.eigvalsh(found.covariance[:2, :2])[0] < MAX_SIGMA_M**2
+    seen = extreme_variances(found.covariance)[0] < MAX_SIGMA_M**2
     return bool(found.converged and found.inliers >= min_inliers and seen)
 
 
