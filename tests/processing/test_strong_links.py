@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from processing.scan_matching import UNSEEN_VARIANCE
-from processing.strong_links import blur
+from processing.strong_links import blur, extreme_variances
 
 
 def unseen_along(tilt_rad: float, turn_per_m: float) -> np.ndarray:
@@ -27,3 +27,11 @@ def test_many_links_of_a_smooth_drift_do_not_add_up_to_seeing_along_it() -> None
 def test_a_match_that_sees_every_direction_is_taken_at_its_word() -> None:
     covariance = np.diag([0.01**2, 0.003**2, 0.0005**2])
     assert_allclose(blur(covariance), covariance)
+
+
+def test_extreme_variances_are_eigenvalues() -> None:
+    for k in range(20):
+        root = np.random.default_rng(k).normal(size=(3, 3)) * [10.0 ** (k % 5 - 2), 0.1, 0.01]
+        covariance = root @ root.T
+        expected = np.linalg.eigvalsh(covariance[:2, :2])
+        np.testing.assert_allclose(extreme_variances(covariance), expected, rtol=1e-6, atol=1e-9 * expected[1])
