@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hw_profiles.errors import RTLogError
+
 Ints = NDArray[np.int64]
 Rows = NDArray[np.float32]
 
@@ -46,7 +48,10 @@ class Ranges:
 
 
 class RangeFile:
-    """Writes the file. Scans shorter than the longest are padded with NaN."""
+    """Writes the file. Scans shorter than the longest are padded with NaN.
+
+    Raises: RTLogError: the disk is full.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows, self.beams = path, 0, 0
@@ -54,11 +59,16 @@ class RangeFile:
 
     def append(self, ranges: Rows) -> None:
         """Append a scan (b,)."""
+        if not self.rows:
+            self.beams = len(ranges)
         if len(ranges) > self.beams:
             self._widen(len(ranges))
         elif len(ranges) < self.beams:
             ranges = np.concatenate([ranges, np.full(self.beams - len(ranges), np.nan, np.float32)])
-        self._file.write(ranges.astype(np.float32, copy=False).tobytes())
+        try:
+            self._file.write(ranges.astype(np.float32, copy=False).tobytes())
+        except OSError as error:
+            raise self._no_room(error) from error
         self.rows += 1
 
     def _widen(self, beams: int) -> None:
@@ -72,8 +82,14 @@ class RangeFile:
 
     def finish(self, is_mirrored: bool) -> Ranges:
         """What was written, ready to be read."""
-        self._file.flush()
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise self._no_room(error) from error
         return Ranges(self.path, (self.rows, self.beams), is_mirrored=is_mirrored)
+
+    def _no_room(self, error: OSError) -> RTLogError:
+        return RTLogError(f"{self.path}: the scans cannot be kept here: {error.strerror or error}; set TMPDIR")
 
     def close(self) -> None:
         self._file.close()

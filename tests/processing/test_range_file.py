@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from hw_profiles.errors import RTLogError
 from processing.range_file import RangeFile, Ranges
 
 ROWS = np.random.default_rng(1).uniform(0, 20, (12, 30)).astype(np.float32)
@@ -45,3 +46,12 @@ def test_a_cut_of_it_is_small_and_finds_its_rows(tmp_path: Path) -> None:
     assert len(pickle.dumps(cut)) < 500
     assert_array_equal(cut[:], ROWS[3:7])
     assert_array_equal(cut[np.array([3, 0])], ROWS[[6, 3]])
+
+
+def test_a_full_disk_is_told() -> None:
+    file = RangeFile(Path("/dev/full"))
+    file.append(ROWS[0])
+    with pytest.raises(RTLogError, match="TMPDIR"):
+        file.finish(is_mirrored=False)
+    with pytest.raises(OSError, match="No space"):
+        file.close()
