@@ -11,7 +11,6 @@ import platform
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ COLUMNS = {  # and which seed is the worst
     "edge length, m": max,
     "precision": min,
     "recall": min,
-    "ticks/s": min,
 }
 WORLDS = ("loop", "two_drifts", "missed_tag", "straight", "mine_level", "tunnels")
 FIRST_SEED = 101
@@ -40,7 +38,7 @@ HEADER = """# Choices, by measurement
 Each simulated world with {seeds} seeds (other walls, other noise), built with each choice; a row is the mean over the
 seeds, the worst seed in brackets. ATE: one rigid move of the whole atlas onto the truth, rms over all poses
 of all runs. RPE: relative error over 10 m and 100 m of driving. Precision and recall are those of the wall cells of the
-map: a wall drawn twice lowers the precision. "ticks/s" is the whole build with `--jobs 2`.
+map: a wall drawn twice lowers the precision.
 
 Made by `{command}` on {machine}.
 """
@@ -52,7 +50,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="default: %(default)s")
     args = parser.parse_args()
     command = " ".join(["python", *sys.argv])
-    print(HEADER.format(seeds=args.seeds, command=command, machine=f"{platform.machine()}, Python {sys.version[:6]}"))
+    print(
+        HEADER.format(
+            seeds=args.seeds, command=command, machine=f"{platform.machine()}, Python {platform.python_version()}"
+        )
+    )
     for world in args.worlds.split(","):
         print(f"## {world}\n")
         print(f"| choice | {' | '.join(COLUMNS)} |\n|---|{'---|' * len(COLUMNS)}")
@@ -72,16 +74,13 @@ def main() -> None:
 
 
 def _measure(truth: Path, atlas: Path, options: list[str]) -> list[float]:
-    began = time.monotonic()
     _run("build", *sorted(truth.glob("*.mcap")), "-o", atlas, "--jobs", "2", *options)
-    seconds = time.monotonic() - began
     found = json.loads(_run("compare", atlas, "--truth", truth, "--json"))["truth"]
-    ticks = sum(run["ticks"] for run in json.loads((atlas / "atlas.json").read_text(encoding="utf-8"))["runs"])
     errors = {error["distance_m"]: error["translation_rmse_m"] for error in found["rpe"]}
     beacons, lengths = ((found[key] or {}).get("rmse", np.nan) for key in ("beacon_error_m", "edge_length_error_m"))
     walls = [found["walls"]["precision"], found["walls"]["recall"]]
     distances = [errors.get(10.0, np.nan), errors.get(100.0, np.nan)]
-    return [found["ate"]["rmse_m"], *distances, beacons, lengths, *walls, ticks / seconds]
+    return [found["ate"]["rmse_m"], *distances, beacons, lengths, *walls]
 
 
 def _run(*arguments: str | Path) -> str:
@@ -94,8 +93,7 @@ def _run(*arguments: str | Path) -> str:
 def _figure(values: np.ndarray, worst: float) -> str:
     if np.isnan(values).any():
         return "–"
-    digits = 3 if worst < 100 else 0
-    return f"{values.mean():.{digits}f} ({worst:.{digits}f})"
+    return f"{values.mean():.3f} ({worst:.3f})"
 
 
 if __name__ == "__main__":
