@@ -156,3 +156,17 @@ def test_stamps_that_run_backwards_are_kept_and_sorted() -> None:
     assert np.all(np.diff(stamps) > 0)
     assert set(stamps.tolist()) == {*run.scans.stamps_ns.tolist(), *run.motion_ns.tolist()}
     assert np.isfinite(poses).all()
+
+
+def test_what_odometry_misses_is_made_up_for_where_the_vehicle_moved() -> None:
+    """It stands, drives a metre within a twentieth of a second by stamps that come in a burst, and stands again."""
+    motion_t = np.array([0.0, 0.5, 0.9, 0.95, 1.5, 2.0])
+    odometry = np.zeros((6, 3))
+    odometry[3:, 0] = 1.0
+    run, loop = a_run(np.array([0.0, 2.0]), motion_t, odometry)
+    _, poses = run_trajectory(run, loop, np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]))  # a tenth more than counted
+    assert_allclose(poses[:, 0], [0.0, 0.0, 0.0, 1.1, 1.1, 1.1], atol=5e-4)
+    _, still = run_trajectory(
+        *a_run(np.array([0.0, 2.0]), motion_t, np.zeros((6, 3))), np.array([[0.0] * 3, [0.1, 0, 0]])
+    )
+    assert_allclose(still[:, 0], 0.05 * motion_t, atol=1e-9)  # nothing to go by but time
