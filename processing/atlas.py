@@ -1,4 +1,4 @@
-"""The atlas: the product, as records in memory and as a folder on disk, written whole or not at all.
+"""The atlas: the product, as a folder on disk, written whole or not at all; what is small of it also in memory.
 
 NAME.atlas/atlas.json                what the graph is made of, and from what
 NAME.atlas/edges/<id>.npz            poses, covariances, links and grid of every piece, in its own frame
@@ -10,8 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,7 @@ from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas_schema import check_document
-from processing.map_files import Overlay, stitch_image, write_map
-from processing.occupancy_grid import Grid
+from processing.map_files import MapImage, Overlay, StoredImage, write_map
 from processing.tum import write_tum
 
 Array = NDArray[np.float64]
@@ -33,10 +31,7 @@ SCHEMA = 1
 @dataclass(frozen=True, slots=True)
 class Atlas:
     document: dict[str, Any]  # what atlas.json holds
-    edges: dict[str, Mapping[str, NDArray[Any]]]  # by edge id, what its npz holds
     trajectories: dict[str, tuple[NDArray[np.int64], Array]]  # by run id: stamps [ns], poses (m, 3)
-    grids: list[Grid]  # in the order of the edges
-    frames: Array  # (edges, 3) of the grids in the atlas
 
 
 def refuse_existing(path: Path) -> None:
@@ -52,8 +47,8 @@ def refuse_existing(path: Path) -> None:
         raise BadInputError(f"{path.parent}: no permission to write here")
 
 
-def write_atlas(path: Path, atlas: Atlas) -> None:
-    """Write the folder beside its place, and move it there once it is whole.
+def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage) -> None:
+    """Write the folder beside its place, and move it there once it is whole. The files of the edges are moved into it.
 
     Raises:
         BadInputError: there is something at `path` already.
@@ -64,7 +59,7 @@ def write_atlas(path: Path, atlas: Atlas) -> None:
         part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
             part.chmod(0o755)
-            _write_files(part, atlas)
+            _write_files(part, atlas, edges, image)
             part.rename(path)
         finally:
             shutil.rmtree(part, ignore_errors=True)  # after the renaming, nothing is there
@@ -72,24 +67,16 @@ def write_atlas(path: Path, atlas: Atlas) -> None:
         raise RTLogError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _write_files(folder: Path, atlas: Atlas) -> None:
+def _write_files(folder: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage) -> None:
     (folder / "edges").mkdir()
     (folder / "trajectories").mkdir()
-    for name, arrays in atlas.edges.items():
-        _write_npz(folder / "edges" / f"{name}.npz", arrays)
+    for edge in edges:
+        shutil.move(edge, folder / "edges" / edge.name)
     for run_id, (stamps_ns, poses) in atlas.trajectories.items():
         write_tum(folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
-    write_map(folder, stitch_image(atlas.grids, atlas.frames), _overlay(atlas))
+    write_map(folder, image, _overlay(atlas))
     text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "atlas.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """As numpy's savez_compressed, which knows only the slow way to compress."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
 
 
 def read_document(path: Path) -> dict[str, Any]:

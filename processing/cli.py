@@ -80,14 +80,14 @@ def _jobs(text: str) -> int:
 
 def _build(args: argparse.Namespace) -> None:
     from hw_profiles.profile import load_profile
-    from processing.atlas import caveats, refuse_existing, write_atlas
+    from processing.atlas import caveats, refuse_existing
     from processing.pipeline import Config, build
 
     refuse_existing(args.output)
     began = time.monotonic()
     profile = load_profile(args.profile) if args.profile else None
-    atlas = build(args.recordings, profile, Config(args.method, args.assembly, args.matcher), args.jobs)
-    write_atlas(args.output, atlas)
+    config = Config(args.method, args.assembly, args.matcher)
+    atlas = build(args.recordings, profile, config, args.output, args.jobs)
     document = atlas.document
     for line in caveats(document):
         print(f"rtlog-atlas: {line}", file=sys.stderr)

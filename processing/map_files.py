@@ -1,27 +1,30 @@
 """Maps on disk: what nav2's map_server reads, and a picture for people.
 
-In: a `Grid`. Out: `map.pgm` and `map.yaml` (trinary: 0 occupied, 254 free, 205 unknown; the first line of pixels is the
-largest y), and `map.png` with the graph over it. Law: the same grid gives the same bytes.
+In: a `Grid`, or many. Out: `map.pgm` and `map.yaml` (trinary: 0 occupied, 254 free, 205 unknown; the first line of
+pixels is the largest y), and `map.png` with the graph over it. Law: the same grid gives the same bytes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from hw_profiles.errors import BadInputError
 from processing.geometry import Array
-from processing.occupancy_grid import Grid, stitch, stitched_window
+from processing.occupancy_grid import Grid, StoredGrid, Window, stitch, stitched_window
+from processing.workers import Workers
 
 Image.MAX_IMAGE_PIXELS = None  # a mine of kilometres is no attack
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # pixels
 OCCUPIED_ABOVE = 1.0  # log-odds: more than a single hit
 FREE_BELOW = -0.3  # log-odds: one look is enough
 PICTURE_PIXELS = 1200, 4000  # the longer side of the picture: at least, at most (up to the whole factor)
-BAND_CELLS = 8_000_000  # that are stitched at once
+BAND_CELLS = 4_000_000  # that are stitched, written and shrunk at once
 MARGIN_PIXELS = 50  # room for the scale bar and the names at the rim
 WALL, OPEN, DARK = (38, 38, 46), (255, 255, 255), (206, 208, 212)
 BLUE, RED, INK = (30, 100, 200), (205, 40, 30), (20, 20, 20)
@@ -33,10 +36,35 @@ class MapImage:
     resolution_m: float
     origin: Array  # (2,) x, y of the lower-left corner of pixel [0, 0]
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.pixels.shape
+
+    def rows(self, which: slice) -> NDArray[np.uint8]:
+        return self.pixels[which]
+
     def occupied_points(self) -> Array:
         """The centres (n, 2) of the occupied cells."""
         rows, columns = np.nonzero(self.pixels == OCCUPIED)
         return self.origin + self.resolution_m * (np.column_stack([columns, rows]) + 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredImage:
+    """A `MapImage` in a file of bare pixels, whose rows are read when they are needed: those of a window of it."""
+
+    path: Path
+    width: int  # of the file
+    corner: tuple[int, int]  # row, column of the file where the window begins
+    shape: tuple[int, int]  # (H, W) of the window
+    resolution_m: float
+    origin: Array  # (2,)
+
+    def rows(self, which: slice) -> NDArray[np.uint8]:
+        first, last, _ = which.indices(self.shape[0])
+        top, left = self.corner
+        pixels = np.fromfile(self.path, np.uint8, (last - first) * self.width, offset=(top + first) * self.width)
+        return pixels.reshape(-1, self.width)[:, left : left + self.shape[1]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,38 +85,53 @@ def to_image(grid: Grid) -> MapImage:
     return MapImage(pixels, grid.resolution_m, grid.origin)
 
 
-def stitch_image(grids: Sequence[Grid], placements: Array) -> MapImage:
-    """`stitch` in three values, a band of rows after the other: a byte a cell, where log-odds take four and more.
+def stitch_image(grids: Sequence[Grid | StoredGrid], placements: Array, path: Path, work: Workers) -> StoredImage:
+    """`stitch` in three values, a band of rows after the other, into the file `path`.
 
-    Raises: ValueError: as `stitch`.
+    Raises: ValueError: as `stitch`. OSError: the disk is full.
     """
     window = stitched_window(grids, placements)
-    pixels = np.full(window.shape, UNKNOWN, dtype=np.uint8)
-    known_rows, known_columns = np.zeros(window.shape[0], bool), np.zeros(window.shape[1], bool)
-    height = max(1, BAND_CELLS // max(1, window.shape[1]))
-    for first in range(0, window.shape[0], height):
-        some = slice(first, first + height)
-        band = stitch(grids, placements, window.rows(some))
-        pixels[some] = to_image(band).pixels
-        known = band.log_odds != 0
-        known_rows[some] = known.any(axis=1)
-        known_columns |= known.any(axis=0)
-    if not known_rows.any():
-        return MapImage(pixels, window.resolution_m, window.origin)
-    rows, columns = np.flatnonzero(known_rows), np.flatnonzero(known_columns)  # the rim of which nothing is known goes
-    origin = window.origin + window.resolution_m * np.array([columns[0], rows[0]])
-    return MapImage(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], window.resolution_m, origin)
+    (height, width), step = window.shape, band_rows(window.shape[1])
+    path.touch()
+    bands = [slice(first, min(first + step, height)) for first in range(0, height, step)]
+    stitch_one = partial(stitch_band, grids=grids, placements=placements, window=window, path=path)
+    known = work.map("map", stitch_one, bands)
+    rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(rows for rows, _ in known)]))
+    if not len(rows):
+        return StoredImage(path, width, (0, 0), window.shape, window.resolution_m, window.origin)
+    columns = np.flatnonzero(np.any([columns for _, columns in known], axis=0))
+    corner = int(rows[0]), int(columns[0])  # the rim of which nothing is known goes
+    shape = int(rows[-1]) + 1 - corner[0], int(columns[-1]) + 1 - corner[1]
+    origin = window.origin + window.resolution_m * np.array(corner[::-1])
+    return StoredImage(path, width, corner, shape, window.resolution_m, origin)
 
 
-def write_map(folder: Path, image: MapImage, overlay: Overlay | None = None) -> None:
+def stitch_band(
+    rows: slice, grids: Sequence[Grid | StoredGrid], placements: Array, window: Window, path: Path
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Write some rows of the file. Returns: of which rows, and which columns, something is known."""
+    band = stitch(grids, placements, window.rows(rows))
+    with path.open("r+b") as file:
+        file.seek(rows.start * window.shape[1])
+        file.write(to_image(band).pixels.data)
+    known = band.log_odds != 0
+    return known.any(axis=1), known.any(axis=0)
+
+
+def band_rows(width: int) -> int:
+    """So many rows of an image are handled at once."""
+    return max(1, BAND_CELLS // max(1, width))
+
+
+def write_map(folder: Path, image: MapImage | StoredImage, overlay: Overlay | None = None) -> None:
     """Write map.pgm, map.yaml and map.png into the folder, which exists; of a map without cells, one unknown pixel."""
-    if not image.pixels.size:
+    if 0 in image.shape:
         image = MapImage(np.full((1, 1), UNKNOWN, dtype=np.uint8), image.resolution_m, image.origin)
-    height, width = image.pixels.shape
+    (height, width), step = image.shape, band_rows(image.shape[1])
     with (folder / "map.pgm").open("wb") as file:
         file.write(b"P5\n%d %d\n255\n" % (width, height))
-        for row in image.pixels[::-1]:
-            file.write(row.tobytes())
+        for last in range(height, 0, -step):
+            file.write(image.rows(slice(max(last - step, 0), last))[::-1].tobytes())
     x, y = (float(value) for value in np.round(image.origin, 6) + 0.0)
     (folder / "map.yaml").write_text(
         f"image: map.pgm\nmode: trinary\nresolution: {float(image.resolution_m)!r}\norigin: [{x!r}, {y!r}, 0.0]\n"
@@ -127,12 +170,14 @@ def read_map(folder: Path) -> MapImage:
     return MapImage(pixels, resolution_m, np.array([x, y]))
 
 
-def draw_map(image: MapImage, overlay: Overlay) -> Image.Image:
+def draw_map(image: MapImage | StoredImage, overlay: Overlay) -> Image.Image:
     """The picture: walls dark, free white, unknown grey; trajectories, edges and named nodes over it; a scale bar."""
-    height, width = image.pixels.shape
+    height, width = image.shape
     least, most = PICTURE_PIXELS
     enlarge, shrink = max(1, least // max(height, width)), -(-max(height, width) // most)
-    pixels = _shrink(image.pixels, shrink)[::-1].repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    step = shrink * max(1, band_rows(width) // shrink)
+    bands = [_shrink(image.rows(slice(first, first + step)), shrink) for first in range(0, height, step)]
+    pixels = np.concatenate(bands)[::-1].repeat(enlarge, axis=0).repeat(enlarge, axis=1)
     colours = np.array([DARK] * 256, dtype=np.uint8)
     colours[OCCUPIED], colours[FREE] = WALL, OPEN
     framed = np.pad(pixels, MARGIN_PIXELS, constant_values=UNKNOWN)
@@ -158,17 +203,18 @@ def draw_map(image: MapImage, overlay: Overlay) -> Image.Image:
     return picture
 
 
+@numba.njit(cache=True)
 def _shrink(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """One pixel of `factor`² each: a wall shows if any is one, else free if any is."""
-    if factor == 1:
-        return pixels
-    pad = [(0, -size % factor) for size in pixels.shape]
-    height, width = (size + more[1] for size, more in zip(pixels.shape, pad, strict=True))
-    rows = np.pad(pixels, pad, constant_values=UNKNOWN).reshape(height // factor, factor, width)
-    lowest, highest = (  # rows first: whole lines of pixels at once
-        of.reshape(height // factor, width // factor, factor) for of in (rows.min(axis=1), rows.max(axis=1))
-    )
-    return np.where(lowest.min(axis=2) == OCCUPIED, np.uint8(OCCUPIED), highest.max(axis=2))
+    height, width = pixels.shape
+    out = np.full((-(-height // factor), -(-width // factor)), UNKNOWN, np.uint8)
+    for row in range(height):
+        line = out[row // factor]
+        for column in range(width):
+            pixel, at = pixels[row, column], column // factor
+            if pixel == OCCUPIED or (pixel == FREE and line[at] != OCCUPIED):
+                line[at] = pixel
+    return out
 
 
 def _draw_scale_bar(

@@ -12,11 +12,12 @@ those of the part, so that no turn leaves holes.
     +-----------+
     origin    W
 
-Limit: a grid is dense; memory follows its bounding box, 8 bytes a cell while it is built.
+Limit: a grid is dense; memory follows its bounding box, 8 bytes a cell while it is built. Many grids wait in files.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -30,10 +31,48 @@ LOWEST, HIGHEST = np.float32(-2.0), np.float32(3.5)  # p = 0.12 … 0.97: beyond
 
 
 @dataclass(frozen=True, slots=True)
+class Window:
+    """Where in the plane the cells of a grid lie."""
+
+    shape: tuple[int, int]  # (H, W)
+    resolution_m: float
+    origin: Array  # (2,) x, y of the lower-left corner of cell [0, 0]
+
+    def rows(self, which: slice) -> "Window":
+        first, last, _ = which.indices(self.shape[0])
+        origin = self.origin + self.resolution_m * np.array([0, first])
+        return Window((last - first, self.shape[1]), self.resolution_m, origin)
+
+
+@dataclass(frozen=True, slots=True)
 class Grid:
     log_odds: NDArray[np.float32]  # (H, W)
     resolution_m: float
-    origin: Array  # (2,) x, y of the lower-left corner of cell [0, 0]
+    origin: Array  # (2,) as of its window
+
+    @property
+    def window(self) -> Window:
+        return Window(self.log_odds.shape, self.resolution_m, self.origin)
+
+    def load(self) -> "Grid":
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class StoredGrid:
+    """A grid in a file; of a loaded one, only what is looked at is read."""
+
+    path: Path
+    window: Window
+
+    def load(self) -> Grid:
+        return Grid(np.load(self.path, mmap_mode="c"), self.window.resolution_m, self.window.origin)
+
+
+def store_grid(grid: Grid, path: Path) -> StoredGrid:
+    """Raises: OSError: the disk is full."""
+    np.save(path, grid.log_odds)
+    return StoredGrid(path, grid.window)
 
 
 def build_grid(
@@ -102,32 +141,18 @@ def _trace(
                 y += step_y
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
-    """Where in the plane the cells of a grid lie."""
-
-    shape: tuple[int, int]  # (H, W)
-    resolution_m: float
-    origin: Array  # (2,)
-
-    def rows(self, which: slice) -> "Window":
-        first, last, _ = which.indices(self.shape[0])
-        origin = self.origin + self.resolution_m * np.array([0, first])
-        return Window((last - first, self.shape[1]), self.resolution_m, origin)
-
-
-def stitched_window(grids: Sequence[Grid], placements: Array) -> Window:
+def stitched_window(grids: Sequence[Grid | StoredGrid], placements: Array) -> Window:
     """What the grids cover together. Raises: ValueError: there is no grid, or their resolutions differ."""
-    if not grids or len(grids) != len(placements) or len({grid.resolution_m for grid in grids}) != 1:
+    if not grids or len(grids) != len(placements) or len({grid.window.resolution_m for grid in grids}) != 1:
         raise ValueError(f"{len(grids)} grids and {len(placements)} placements do not make one map of one resolution")
-    resolution_m = grids[0].resolution_m
-    corners = np.concatenate([_corners(grid, pose) for grid, pose in zip(grids, placements, strict=True)])
+    resolution_m = grids[0].window.resolution_m
+    corners = np.concatenate([_corners(grid.window, pose) for grid, pose in zip(grids, placements, strict=True)])
     low = np.floor(corners.min(axis=0) / resolution_m + 1e-6)
     width, height = (np.ceil(corners.max(axis=0) / resolution_m - 1e-6) - low).astype(int).tolist()
     return Window((height, width), resolution_m, low * resolution_m)
 
 
-def stitch(grids: Sequence[Grid], placements: Array, window: Window | None = None) -> Grid:
+def stitch(grids: Sequence[Grid | StoredGrid], placements: Array, window: Window | None = None) -> Grid:
     """One grid of many: each placed by its pose in `placements` (k, 3), log-odds added, values in between interpolated.
 
     Of the whole, or of a window of it.
@@ -142,19 +167,22 @@ def stitch(grids: Sequence[Grid], placements: Array, window: Window | None = Non
     return whole
 
 
-def add_grid(whole: Grid, part: Grid, pose: Array) -> None:
+def add_grid(whole: Grid, part: Grid | StoredGrid, pose: Array) -> None:
     """Add the log-odds of `part`, placed at `pose` (3,), to those cells of `whole` that it covers, in place.
 
     `whole` may be any window of the plane: a map too large for the memory is made window by window.
     """
     resolution_m = whole.resolution_m
-    corners = (_corners(part, pose) - whole.origin) / resolution_m
+    corners = (_corners(part.window, pose) - whole.origin) / resolution_m
     first = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
     last = np.minimum(np.ceil(corners.max(axis=0)), whole.log_odds.shape[::-1]).astype(int)
+    if np.any(first >= last):
+        return
     # the centre of cell [0, 0] of the whole, and the pose's turn, seen from the part in its cells
     back = inverse(pose)
-    start = (transform(back, whole.origin + resolution_m / 2) - part.origin) / resolution_m - 0.5
-    _resample(whole.log_odds, part.log_odds, start, np.array([np.cos(back[2]), np.sin(back[2])]), first, last)
+    start = (transform(back, whole.origin + resolution_m / 2) - part.window.origin) / resolution_m - 0.5
+    turn = np.array([np.cos(back[2]), np.sin(back[2])])
+    _resample(whole.log_odds, part.load().log_odds, start, turn, first, last)
 
 
 @numba.njit(cache=True)
@@ -187,8 +215,8 @@ def _resample(
             whole[row, column] += np.float32(value)
 
 
-def _corners(grid: Grid, pose: Array) -> Array:
-    """The four corners (4, 2) of the placed grid."""
-    height, width = grid.log_odds.shape
+def _corners(window: Window, pose: Array) -> Array:
+    """The four corners (4, 2) of the placed window."""
+    height, width = window.shape
     unit = np.array([[0, 0], [width, 0], [width, height], [0, height]])
-    return transform(pose, grid.origin + grid.resolution_m * unit)
+    return transform(pose, window.origin + window.resolution_m * unit)

@@ -1,7 +1,7 @@
 """The whole method in one screen: recordings in, atlas out.
 
 recordings ─ read_log ─ open_loop ─ beacons ─┐
-                                             graph ─ pieces (edge_map) ─ assembly ─ grids ─ Atlas
+                                             graph ─ pieces (edge_map) ─ assembly ─ edge_files ─ map_files ─ Atlas
                                                └─────── tags missed ◄───────┘
 """
 
@@ -16,16 +16,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hw_profiles.errors import BadInputError
+from hw_profiles.errors import BadInputError, RTLogError
 from hw_profiles.profile import Profile
-from processing.atlas import Atlas
+from processing.atlas import Atlas, write_atlas
 from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass, find_passes
 from processing.calibration import WheelScale, calibrate
-from processing.edge_placement import Placed, Placement, place_by_frames
+from processing.edge_files import edge_of, store_edge
+from processing.edge_placement import Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
 from processing.length_placement import place_by_lengths
-from processing.occupancy_grid import Grid
+from processing.map_files import StoredImage, stitch_image
 from processing.odometry import Motions, dead_reckon
 from processing.open_loop import (
     OpenLoop,
@@ -35,7 +36,7 @@ from processing.open_loop import (
     mount_pose,
     odometry_at_scans,
 )
-from processing.pieces import PieceInput, SolvedPiece, cut_span, draw_piece, rename, solve_piece
+from processing.pieces import PieceInput, SolvedPiece, cut_span, rename, solve_piece
 from processing.polar_matching import match_polar
 from processing.read_log import Run, read_log
 from processing.recordings import group_parts
@@ -80,17 +81,25 @@ class DrivenRun:
     passes: list[Pass]
 
 
-def build(recordings: list[Path], profile: Profile | None, config: Config, jobs: int = 1) -> Atlas:
-    """Map recordings. Raises: BadInputError: a recording is unfit, or it cannot be told which run it is."""
+def build(recordings: list[Path], profile: Profile | None, config: Config, output: Path, jobs: int = 1) -> Atlas:
+    """Map recordings and write the atlas.
+
+    Raises:
+        BadInputError: a recording is unfit, or it cannot be told which run it is, or the output exists already.
+        RTLogError: a disk is full, or a process died.
+    """
     parts = group_parts(recordings)
     match = MATCHERS[config.matcher]
-    with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as scratch:
-        take_in = partial(read_run, profile=profile, config=config, scratch=Path(scratch))
+    with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as temporary:
+        scratch = Path(temporary)
+        take_in = partial(read_run, profile=profile, config=config, scratch=scratch)
         runs = drive_through(work.map("recordings", take_in, parts), work, match)
         runs, left_out = leave_out_moved(runs)
         runs, graph, placed = map_network(runs, work, match, config)
-        grids = work.map("grids", partial(draw_placed, resolution_m=config.resolution_m), placed.pieces)
-    return assemble_atlas(runs, graph, placed, grids, config, remarks(runs, placed), left_out)
+        edges, image = draw(runs, placed, config.resolution_m, scratch, work)
+        atlas = assemble_atlas(runs, graph, placed, config, remarks(runs, placed), left_out)
+        write_atlas(output, atlas, edges, image)
+    return atlas
 
 
 def map_network(
@@ -169,5 +178,15 @@ def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
     return PieceInput(name, piece, paths, sights, mount_pose(runs[piece.spans[0].run].run))
 
 
-def draw_placed(placed: Placed, resolution_m: float) -> Grid:
-    return draw_piece(placed.solved.input, placed.solved.map.firsts, placed.edge_poses, resolution_m)
+def draw(
+    runs: list[DrivenRun], placed: Placement, resolution_m: float, scratch: Path, work: Workers
+) -> tuple[list[Path], StoredImage]:
+    """The files of the edges, and the stitched picture; all of it in the scratch folder."""
+    store = partial(store_edge, resolution_m=resolution_m, folder=scratch)
+    frames = np.array([piece.frame for piece in placed.pieces])
+    try:
+        edges = work.map("edges", store, [edge_of(piece, runs) for piece in placed.pieces])
+        image = stitch_image([edge.grid for edge in edges], frames, scratch / "map", work)
+    except OSError as error:
+        raise RTLogError(f"{scratch}: no room for the grids: {error.strerror or error}; set TMPDIR") from error
+    return [edge.arrays for edge in edges], image

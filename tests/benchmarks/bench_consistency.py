@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from table import Figure, report
 
-from processing.atlas import read_document, write_atlas
+from processing.atlas import read_document
 from processing.comparison import read_trajectories
 from processing.consistency import consistency, edge_errors, truth_at
 from processing.geometry import Array
@@ -44,7 +44,7 @@ def main() -> int:
         for seed in SEEDS:
             folder, atlas = Path(temporary) / str(seed), Path(temporary) / f"{seed}.atlas"
             runs = simulate(world, folder, seed)
-            write_atlas(atlas, build([run.path for run in runs], None, Config()))
+            build([run.path for run in runs], None, Config(), atlas)
             document = read_document(atlas)
             truths = {run_id: read_tum(folder / f"{run_id}.tum") for run_id in read_trajectories(atlas)}
             errors += edge_errors(atlas, document["edges"], truths)

@@ -51,6 +51,6 @@ def build(recordings: list[Path], atlas: Path, *options: str) -> Build:
 
 
 def same_atlas(a: Path, b: Path) -> bool:
-    """Byte for byte in the document and the trajectories?"""
-    names = [path.relative_to(a) for path in [a / "atlas.json", *sorted((a / "trajectories").iterdir())]]
-    return all((a / name).read_bytes() == (b / name).read_bytes() for name in names)
+    """Byte for byte in every file?"""
+    ours, theirs = ({str(p.relative_to(of)): p for p in of.rglob("*") if p.is_file()} for of in (a, b))
+    return ours.keys() == theirs.keys() and all(ours[k].read_bytes() == theirs[k].read_bytes() for k in ours)

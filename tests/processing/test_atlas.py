@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas import Atlas, read_document, refuse_existing, write_atlas
+from processing.edge_files import write_npz
 from processing.geometry import compose, relative, transform
-from processing.map_files import read_map
-from processing.occupancy_grid import Grid
+from processing.map_files import FREE, MapImage, read_map
 from processing.tum import read_tum
 from rtlog_client.log_file import read_info
 
@@ -36,15 +37,20 @@ DOCUMENT = {"schema": 1, "runs": RUNS, "nodes": NODES, "edges": [EDGE], "remarks
 
 
 def tiny_atlas(**changes: Any) -> Atlas:
-    grid = Grid(np.full((20, 50), -1.0, np.float32), 0.1, np.array([-0.5, -1.0]))
     parts: dict[str, Any] = {
         "document": DOCUMENT,
-        "edges": {"0-1": {"poses": np.zeros((3, 3))}},
         "trajectories": {"monday": (np.arange(3), np.zeros((3, 3))), "tuesday": (np.arange(2), np.ones((2, 3)))},
-        "grids": [grid],
-        "frames": np.zeros((1, 3)),
     }
     return Atlas(**(parts | changes))
+
+
+def write_tiny(path: Path, **changes: Any) -> None:
+    """Write it, with one edge and an image."""
+    with tempfile.TemporaryDirectory() as scratch:
+        edge = Path(scratch) / "0-1.npz"
+        write_npz(edge, {"poses": np.zeros((3, 3))})
+        image = MapImage(np.full((20, 50), FREE, np.uint8), 0.1, np.array([-0.5, -1.0]))
+        write_atlas(path, tiny_atlas(**changes), [edge], image)
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
@@ -54,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes | None]:
 
 
 def test_an_atlas_is_a_folder(tmp_path: Path) -> None:
-    write_atlas(tmp_path / "a.atlas", tiny_atlas())
+    write_tiny(tmp_path / "a.atlas")
     assert [path.name for path in tmp_path.iterdir()] == ["a.atlas"]
     assert list(contents(tmp_path / "a.atlas")) == [
         "atlas.json",
@@ -73,19 +79,19 @@ def test_an_atlas_is_a_folder(tmp_path: Path) -> None:
 
 def test_the_same_atlas_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.atlas", "b.atlas"):
-        write_atlas(tmp_path / name, tiny_atlas())
+        write_tiny(tmp_path / name)
     assert contents(tmp_path / "a.atlas") == contents(tmp_path / "b.atlas")
 
 
 def test_what_exists_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
-    write_atlas(tmp_path / "a.atlas", tiny_atlas())
+    write_tiny(tmp_path / "a.atlas")
     (tmp_path / "file.atlas").write_text("dear to someone")
     (tmp_path / "empty.atlas").mkdir()
     (tmp_path / "dangling.atlas").symlink_to(tmp_path / "nowhere")
     before = contents(tmp_path)
     for name in ("a.atlas", "file.atlas", "empty.atlas", "dangling.atlas"):
         with pytest.raises(BadInputError, match=rf"{name} exists already; it is left as it is$"):
-            write_atlas(tmp_path / name, tiny_atlas(document={"schema": 1, "nodes": [], "edges": []}))
+            write_tiny(tmp_path / name, document={"schema": 1, "nodes": [], "edges": []})
     assert contents(tmp_path) == before
 
 
@@ -120,7 +126,7 @@ class Interrupted(dict[str, Any]):
 
 def test_an_interrupt_midway_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        write_atlas(tmp_path / "a.atlas", tiny_atlas(trajectories=Interrupted(tiny_atlas().trajectories)))
+        write_tiny(tmp_path / "a.atlas", trajectories=Interrupted(tiny_atlas().trajectories))
     assert not list(tmp_path.iterdir())
 
 
@@ -128,8 +134,7 @@ WRITER = """
 import resource, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_atlas import tiny_atlas
-from processing.atlas import write_atlas
+from test_atlas import tiny_atlas, write_tiny
 
 class Halting(dict):
     def items(self):
@@ -139,10 +144,9 @@ class Halting(dict):
 
 if sys.argv[3] == "full":
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # as a full disk, a write fails midway
-    atlas = tiny_atlas()
+    write_tiny(Path(sys.argv[1]))
 else:
-    atlas = tiny_atlas(trajectories=Halting(tiny_atlas().trajectories))
-write_atlas(Path(sys.argv[1]), atlas)
+    write_tiny(Path(sys.argv[1]), trajectories=Halting(tiny_atlas().trajectories))
 """
 
 
@@ -156,7 +160,7 @@ def test_a_kill_midway_leaves_no_half_atlas(tmp_path: Path) -> None:
         assert (part / "trajectories" / "monday.tum").exists()  # it was indeed under way
         writer.send_signal(signal.SIGKILL)
     assert not (tmp_path / "a.atlas").exists()
-    write_atlas(tmp_path / "a.atlas", tiny_atlas())  # what the kill left is in nobody's way
+    write_tiny(tmp_path / "a.atlas")  # what the kill left is in nobody's way
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
@@ -165,15 +169,6 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     last_line = result.stderr.splitlines()[-1]
     assert last_line == f"{RTLogError.__module__}.RTLogError: {tmp_path}/a.atlas: cannot be written: File too large"
     assert not list(tmp_path.iterdir())
-
-
-def test_the_unknown_around_the_map_is_left_out(tmp_path: Path) -> None:
-    log_odds = np.zeros((40, 60), np.float32)
-    log_odds[10:13, 20:25], log_odds[12, 22] = -1.0, 3.0
-    write_atlas(tmp_path / "a.atlas", tiny_atlas(grids=[Grid(log_odds, 0.1, np.array([-3.0, 2.0]))]))
-    image = read_map(tmp_path / "a.atlas")
-    assert image.pixels.shape == (3, 5)
-    assert_allclose(image.occupied_points(), [[-0.75, 3.25]], atol=1e-6)
 
 
 @pytest.mark.parametrize(

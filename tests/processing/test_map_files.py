@@ -22,7 +22,8 @@ from processing.map_files import (
     to_image,
     write_map,
 )
-from processing.occupancy_grid import Grid, stitch
+from processing.occupancy_grid import Grid, stitch, store_grid
+from processing.workers import Workers
 
 
 @pytest.fixture
@@ -115,17 +116,31 @@ def test_damaged_image_is_refused(tmp_path: Path, grid: Grid) -> None:
 
 
 def test_a_map_stitched_in_bands_is_the_whole_without_its_empty_rim(
-    grid: Grid, monkeypatch: pytest.MonkeyPatch
+    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     placements = np.array([[0.0, 0.0, 0.0], [1.1, 0.6, 0.4]])
     whole = to_image(stitch([grid, grid], placements))
     known = np.argwhere(stitch([grid, grid], placements).log_odds != 0)
     (low, left), (high, right) = known.min(axis=0), known.max(axis=0) + 1
     assert left > 0
+    stored, work = store_grid(grid, tmp_path / "grid.npy"), Workers(1)
+    pictures = set()
     for cells in (10**6, 300, 1):
         monkeypatch.setattr("processing.map_files.BAND_CELLS", cells)
-        image = stitch_image([grid, grid], placements)
-        assert_array_equal(image.pixels, whole.pixels[low:high, left:right])
+        image = stitch_image([stored, grid], placements, tmp_path / f"map{cells}", work)
+        assert_array_equal(image.rows(slice(None)), whole.pixels[low:high, left:right])
+        assert_array_equal(image.rows(slice(3, 5)), whole.pixels[low + 3 : low + 5, left:right])
         assert_allclose(image.origin, whole.origin + 0.05 * np.array([left, low]))
+        (tmp_path / str(cells)).mkdir()
+        write_map(tmp_path / str(cells), image)
+        assert_array_equal(read_map(tmp_path / str(cells)).pixels, image.rows(slice(None)))
+        pictures.add((tmp_path / str(cells) / "map.png").read_bytes())
+    assert len(pictures) == 1
+    spot = np.zeros((40, 60), np.float32)
+    spot[10:13, 20:25], spot[12, 22] = -1.0, 3.0
+    image = stitch_image([Grid(spot, 0.1, np.array([-3.0, 2.0]))], np.zeros((1, 3)), tmp_path / "spot", work)
+    write_map(tmp_path, image)
+    assert image.shape == (3, 5)
+    assert_allclose(read_map(tmp_path).occupied_points(), [[-0.75, 3.25]], atol=1e-6)
     nothing = Grid(np.zeros((4, 5), np.float32), 0.05, np.zeros(2))
-    assert np.all(stitch_image([nothing], placements[:1]).pixels == UNKNOWN)
+    assert np.all(stitch_image([nothing], placements[:1], tmp_path / "nothing", work).rows(slice(None)) == UNKNOWN)

@@ -12,7 +12,7 @@ import pytest
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
-from processing.atlas import Atlas, read_document, write_atlas
+from processing.atlas import Atlas, read_document
 from processing.geometry import align, compose, transform, wrap_angle
 from processing.pieces import drift_suffix
 from processing.pipeline import Config, build
@@ -38,8 +38,13 @@ def recordings(small_world: Path) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def atlas(recordings: list[Path]) -> Atlas:
-    return build(recordings, None, Config())
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("one_process") / "small.atlas"
+
+
+@pytest.fixture(scope="module")
+def atlas(recordings: list[Path], one_process: Path) -> Atlas:
+    return build(recordings, None, Config(), one_process)
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +55,12 @@ def short(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> P
     return rewrite(recordings[1], target, lambda m: m.topic != "/rfid/tags" and m.log_time_ns < start_ns + 8 * 10**9)
 
 
-def test_one_process_or_two_give_the_same_bytes(atlas: Atlas, small_atlas: Path, tmp_path: Path) -> None:
-    write_atlas(tmp_path / "again.atlas", atlas)
+@pytest.mark.usefixtures("atlas")
+def test_one_process_or_two_give_the_same_bytes(one_process: Path, small_atlas: Path) -> None:
     names = sorted(str(path.relative_to(small_atlas)) for path in small_atlas.rglob("*") if path.is_file())
     assert len(names) == 1 + 9 + 2 + 3
     for name in names:
-        assert (tmp_path / "again.atlas" / name).read_bytes() == (small_atlas / name).read_bytes(), name
+        assert (one_process / name).read_bytes() == (small_atlas / name).read_bytes(), name
 
 
 def test_the_walls_close_and_the_drive_is_the_true_one(atlas: Atlas, small_world: Path) -> None:
@@ -132,8 +137,8 @@ def test_a_turn_around_is_a_spur_of_its_tag(atlas: Atlas) -> None:
     assert last["to"] == 431
 
 
-def test_a_run_without_tags_is_mapped_alone_and_that_is_said(short: Path, recordings: list[Path]) -> None:
-    atlas = build([short], None, Config())
+def test_a_run_without_tags_is_mapped_alone_and_that_is_said(short: Path, tmp_path: Path) -> None:
+    atlas = build([short], None, Config(), tmp_path / "a.atlas")
     assert atlas.document["nodes"] == []
     assert [(edge["id"], edge["kind"], edge["length"]) for edge in atlas.document["edges"]] == [("run-0", "run", None)]
     assert "run short passed 0 tags: it is mapped alone" in atlas.document["remarks"]
@@ -146,7 +151,7 @@ def test_a_run_without_tags_is_mapped_alone_and_that_is_said(short: Path, record
 def test_parts_that_nothing_joins_lie_side_by_side(short: Path, recordings: list[Path], tmp_path: Path) -> None:
     end_ns = read_info(recordings[0]).start_ns + 14 * 10**9
     start = rewrite(recordings[0], tmp_path / "start.mcap", lambda m: m.log_time_ns < end_ns)  # past the first tag
-    atlas = build([short, start], None, Config())
+    atlas = build([short, start], None, Config(), tmp_path / "a.atlas")
     assert {edge["part"] for edge in atlas.document["edges"]} == {0, 1}
     assert any("unconnected parts" in remark for remark in atlas.document["remarks"])
     first, second = (poses[:, 0] for _, poses in atlas.trajectories.values())
@@ -155,8 +160,8 @@ def test_parts_that_nothing_joins_lie_side_by_side(short: Path, recordings: list
 
 
 @pytest.mark.parametrize("assembly", ["refined", "paper"])
-def test_the_global_method_needs_no_tags(short: Path, assembly: Any) -> None:
-    atlas = build([short], None, Config(method="global", assembly=assembly))
+def test_the_global_method_needs_no_tags(short: Path, assembly: Any, tmp_path: Path) -> None:
+    atlas = build([short], None, Config(method="global", assembly=assembly), tmp_path / "a.atlas")
     assert (len(atlas.document["nodes"]), len(atlas.document["edges"])) == (0, 1)
     assert atlas.document["parameters"] == {
         "method": "global",
@@ -166,12 +171,12 @@ def test_the_global_method_needs_no_tags(short: Path, assembly: Any) -> None:
     }
 
 
-def test_a_named_profile_wins_over_the_one_inside(short: Path) -> None:
+def test_a_named_profile_wins_over_the_one_inside(short: Path, tmp_path: Path) -> None:
     text = read_profile_text("canmet_trailer").replace('name = "canmet_trailer"', 'name = "mended"')
     drawn_back = re.sub(r"x_m = -?[0-9.]+", "x_m = -3.6", text)
     runs = {
-        "inside": build([short], None, Config()),
-        "named": build([short], parse_profile(drawn_back, source="a test"), Config()),
+        "inside": build([short], None, Config(), tmp_path / "inside.atlas"),
+        "named": build([short], parse_profile(drawn_back, source="a test"), Config(), tmp_path / "named.atlas"),
     }
     names = {key: found.document["runs"][0]["profile"] for key, found in runs.items()}
     assert names == {"inside": "canmet_trailer", "named": "mended"}
@@ -194,7 +199,7 @@ def test_the_same_run_twice_is_refused_before_any_work(recordings: list[Path], t
         ([recordings[1], copy], r"small-back\.mcap and .*copy\.mcap hold the same time of run small-back; which"),
     ):
         with pytest.raises(BadInputError, match=said):
-            build([recordings[0], *twice], None, Config())
+            build([recordings[0], *twice], None, Config(), tmp_path / "a.atlas")
     assert time.monotonic() - began < 1
 
 
@@ -202,14 +207,14 @@ def test_the_same_run_twice_is_refused_before_any_work(recordings: list[Path], t
 def test_a_run_does_not_choose_where_it_is_written(recordings: list[Path], tmp_path: Path, run_id: str) -> None:
     named = rewrite(recordings[1], tmp_path / "a.mcap", lambda m: m.topic == "/rtlog/tick", {"run_id": run_id})
     with pytest.raises(BadInputError, match=r"a\.mcap: the run is called '.*', which no file can be"):
-        build([named], None, Config())
+        build([named], None, Config(), tmp_path / "a.atlas")
 
 
 def test_a_recording_too_short_to_map_is_named(recordings: list[Path], tmp_path: Path) -> None:
     start_ns = read_info(recordings[1]).start_ns
     brief = rewrite(recordings[1], tmp_path / "brief.mcap", lambda m: m.log_time_ns < start_ns + 500_000_000)
     with pytest.raises(BadInputError, match=r"brief\.mcap: \d scans are too few to map"):
-        build([brief], None, Config())
+        build([brief], None, Config(), tmp_path / "a.atlas")
 
 
 def test_info_reads_what_build_wrote(atlas: Atlas, small_atlas: Path) -> None:

@@ -79,16 +79,17 @@ def test_two_runs_of_one_name_are_not_taken_for_one(whole: Path, tmp_path: Path,
         group_parts([second, first])
 
 
-def test_a_split_run_is_mapped_as_the_whole_one(parts: list[Path], whole: Path) -> None:
-    one, split = build([whole], None, Config()), build([parts[1], parts[2], parts[0]], None, Config())
+def test_a_split_run_is_mapped_as_the_whole_one(parts: list[Path], whole: Path, tmp_path: Path) -> None:
+    one = build([whole], None, Config(), tmp_path / "one.atlas")
+    split = build([parts[1], parts[2], parts[0]], None, Config(), tmp_path / "split.atlas")
     assert list(split.trajectories) == ["small-back"]
     for ours, theirs in zip(split.trajectories["small-back"], one.trajectories["small-back"], strict=True):
         assert np.array_equal(ours, theirs)
     assert split.document["edges"] == one.document["edges"]
 
 
-def test_a_missing_part_is_told(parts: list[Path]) -> None:
-    lost = build([parts[0], parts[2]], None, Config())
+def test_a_missing_part_is_told(parts: list[Path], tmp_path: Path) -> None:
+    lost = build([parts[0], parts[2]], None, Config(), tmp_path / "lost.atlas")
     (gap,) = [line for line in lost.document["remarks"] if "without a scan" in line]
     assert gap.startswith("run small-back moved 2")  # 10 s at 3 m/s at most
     assert "m in 10.2 s without a scan after tick 99" in gap

@@ -17,7 +17,6 @@ import processing.cli
 import rtlog_client.cli
 import rtlog_server.cli
 from hw_profiles.profile import read_profile_text
-from processing.atlas import write_atlas
 from processing.pipeline import Config, build
 from rtlog_client.log_file import LogWriter
 from rtlog_server.messages import JointState, LaserScan, TagReads, Tick, encode, header, to_time
@@ -92,7 +91,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "typo_world.toml").write_text(WORLD.replace("speed_m_s", "sped_m_s"))
     (folder / "carmen.log").write_text(f"FLASER 180 {'2.5 ' * 180}0 0 0 0 0 0 976052857.3 host 0.1\n")
     (folder / "log.gz").write_bytes(b"\x1f\x8b\x08 no, not really")
-    write_atlas(folder / "good.atlas", build([folder / "good.mcap"], None, Config()))
+    build([folder / "good.mcap"], None, Config(), folder / "good.atlas")
     (folder / "there.atlas").mkdir()
     (folder / "there.atlas" / "atlas.json").write_text("dear to someone")
     (folder / "new.atlas").mkdir()
