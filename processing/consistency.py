@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from processing.edge_arrays import read_edge_arrays
 from processing.geometry import Array, relative, rotation, wrap_angle
 
 DIMENSIONS = 3
@@ -64,16 +65,19 @@ def edge_error(name: str, poses: Array, covariances: Array, truth: Array) -> Edg
 def edge_errors(
     atlas: Path, edges: list[Mapping[str, Any]], truths: Mapping[str, tuple[NDArray[np.int64], Array]]
 ) -> list[EdgeError]:
-    """The first drive through each edge whose run has a truth: by run id stamps [ns] ascending, and poses (m, 3)."""
+    """The first drive through each edge whose run has a truth: by run id stamps [ns] ascending, and poses (m, 3).
+
+    Raises: BadInputError: the file of an edge is missing or damaged.
+    """
     found = []
     for edge in edges:
         file = atlas / "edges" / f"{edge['id']}.npz"
         run = edge["paths"][0]["run"]
-        if edge["kind"] != "edge" or not file.is_file() or run not in truths:
+        if edge["kind"] != "edge" or run not in truths:
             continue
-        with np.load(file) as arrays:
-            first = slice(0, int(arrays["path_firsts"][1]))
-            poses, covariances, stamps_ns = (arrays[key][first] for key in ("poses", "covariances", "stamps_ns"))
+        arrays = read_edge_arrays(file, ("path_firsts", "poses", "covariances", "stamps_ns"))
+        first = slice(0, int(arrays["path_firsts"][1]))
+        poses, covariances, stamps_ns = (arrays[key][first] for key in ("poses", "covariances", "stamps_ns"))
         error = edge_error(edge["id"], poses, covariances, truth_at(*truths[run], stamps_ns))
         if error is not None:
             found.append(error)

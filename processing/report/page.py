@@ -9,13 +9,13 @@ from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hw_profiles.errors import BadInputError, RTLogError
+from hw_profiles.errors import RTLogError
 from processing.atlas import caveats, read_document
+from processing.edge_arrays import read_edge_arrays
 from processing.geometry import Array
 from processing.map_files import MapImage, read_map
 from processing.report.pictures import (
@@ -30,6 +30,10 @@ from processing.report.pictures import (
 from processing.tum import read_tum
 
 TEMPLATE = Path(__file__).with_name("page.html")
+SHOWN = (
+    *("poses", "covariances", "path_firsts", "link_ends", "link_strong", "link_squared_distances"),
+    *("grid_log_odds", "grid_resolution", "grid_origin"),
+)
 Document = Mapping[str, Any]
 
 
@@ -54,7 +58,7 @@ def make_page(atlas: Path) -> str:
     document, image = read_document(atlas), read_map(atlas)
     trails = {run["id"]: read_tum(atlas / "trajectories" / f"{run['id']}.tum")[1][:, :2] for run in document["runs"]}
     numbers = {run_id: number for number, run_id in enumerate(trails)}
-    edges = [(edge, _read_arrays(atlas / "edges" / f"{edge['id']}.npz")) for edge in document["edges"]]
+    edges = [(edge, read_edge_arrays(atlas / "edges" / f"{edge['id']}.npz", SHOWN)) for edge in document["edges"]]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         name=escape(atlas.name),
         summary=_summary(document, trails),
@@ -141,14 +145,6 @@ def _edge(edge: Document, arrays: Mapping[str, NDArray[Any]], numbers: Mapping[s
         f"{draw_edge(arrays, [numbers[path['run']] for path in edge['paths']])}"
         f'<div class="beside"><ul>{paths}</ul><div class="residuals">{draw_residuals(squared)}</div></div></section>'
     )
-
-
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise BadInputError(f"{path}: {error}") from error
 
 
 def _length(trail: Array) -> float:

@@ -1,11 +1,13 @@
 """NEES: three where the covariances are right, and the band that its mean may lie in by chance."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from hw_profiles.errors import BadInputError
 from processing.consistency import consistency, edge_error, edge_errors, mean_band, truth_at
 from processing.geometry import accumulate, compose, relative
 
@@ -68,3 +70,25 @@ def test_edges_are_read_from_an_atlas_and_spurs_are_not(tmp_path: Path) -> None:
     expected = edge_error("0-1", poses, covariances, truth)
     assert expected is not None
     assert [(error.edge, error.nees) for error in found] == [("0-1", pytest.approx(expected.nees))]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "No such file or directory"),
+        (b"", "damaged: No data left in file"),
+        (b"PK\x03\x04 torn", "damaged: File is not a zip file"),
+        (b"dear diary", "damaged: "),
+    ],
+)
+def test_a_damaged_file_of_an_edge_is_named(content: bytes | None, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "edges").mkdir()
+    file = tmp_path / "edges" / "0-1.npz"
+    if content is not None:
+        file.write_bytes(content)
+    edges = [{"id": "0-1", "kind": "edge", "paths": [{"run": "known"}]}]
+    with pytest.raises(BadInputError, match=f"^{re.escape(f'{file}: {reason}')}"):
+        edge_errors(tmp_path, edges, {"known": (np.arange(2), np.zeros((2, 3)))})
+    np.savez(file, poses=np.zeros((2, 3)))
+    with pytest.raises(BadInputError, match=r"0-1\.npz: path_firsts is not a file in the archive"):
+        edge_errors(tmp_path, edges, {"known": (np.arange(2), np.zeros((2, 3)))})
