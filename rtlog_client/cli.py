@@ -80,19 +80,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_verbs(parser, argv)
 
 
+def _number(text: str) -> float:
+    """NaN for what is no number: it lies within no bounds."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def _seconds(text: str) -> float:
-    seconds = float(text)
+    seconds = _number(text)
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is no number of seconds above 0")
     return seconds
 
 
 def _rate(text: str) -> float | None:
-    return None if text == "max" else _seconds(text)
+    if text == "max":
+        return None
+    rate = _number(text)
+    if not 0 < rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is neither max nor a number above 0")
+    return rate
 
 
 def _start(text: str) -> float:
-    return 0.0 if text == "0" else _seconds(text)
+    seconds = _number(text)
+    if not 0 <= seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is no number of seconds from 0 on")
+    return seconds
 
 
 def _stop_on_signals() -> threading.Event:

@@ -20,7 +20,7 @@ def recording(tmp_path: Path, bench: Any) -> Path:
     return tmp_path / "run.mcap"
 
 
-@pytest.mark.parametrize("verb", ["record", "recover", "audit", "replay"])
+@pytest.mark.parametrize("verb", ["record", "recover", "audit", "replay", "compare"])
 def test_help_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main([verb, "--help"])
@@ -41,6 +41,11 @@ def test_help_has_an_example(verb: str, capsys: pytest.CaptureFixture[str]) -> N
         (["replay", "{folder}/run.mcap", "--to", "devices", "--profile", "nil"], 2, "profile nil: No such file"),
         (["replay", "{folder}/run.mcap", "--to", "zenoh", "--start", "60"], 2, "nothing to replay after 60 s"),
         (["replay", "{folder}/run.mcap", "--to", "devices", "--profile", "cu_ss534"], 2, "lacks drive_wheel, steering"),
+        (["compare", "{folder}/run.mcap", "{folder}/nowhere.mcap"], 2, "nowhere.mcap: No such file or directory"),
+        (["compare", "{folder}/run.mcap", "{folder}/empty.mcap"], 2, "empty.mcap: the file is empty"),
+        (["compare", "{folder}/run.mcap", "{folder}/text.mcap"], 2, "text.mcap: not an MCAP recording"),
+        (["compare", "{folder}/run.mcap", "{folder}/run.mcap"], 2, "run.mcap: no profile in it"),
+        (["compare", "{folder}/run.mcap", "{folder}/cut.mcap"], 2, "cut.mcap: cut off or damaged"),
         (["record", "-o", "{folder}/text.mcap"], 2, "text.mcap: cannot be written"),
         (["record", "-o", "{folder}", "--connect", "nonsense"], 2, "nonsense: no zenoh endpoint"),
     ],
@@ -59,6 +64,26 @@ def test_what_is_wrong_is_said_in_one_line(
     assert line in output.err
     assert output.err.count("\n") == 1
     assert sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "line"),
+    [
+        ("--start", "-1", "-1 is no number of seconds from 0 on"),
+        ("--start", "soon", "soon is no number of seconds from 0 on"),
+        ("--duration", "0", "0 is no number of seconds above 0"),
+        ("--duration", "nan", "nan is no number of seconds above 0"),
+        ("--rate", "0", "0 is neither max nor a number above 0"),
+        ("--rate", "fast", "fast is neither max nor a number above 0"),
+    ],
+)
+def test_numbers_without_sense_are_refused(
+    option: str, value: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["replay", "run.mcap", "--to", "devices", option, value])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"argument {option}: {line}\n")
 
 
 def test_recover_tells_what_came_back(tmp_path: Path, recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
