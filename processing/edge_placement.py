@@ -5,7 +5,8 @@ its poses in that frame. The frame of an edge lies at its lower node, its x-axis
 spurs lie at their node; a run without tags at its first pose. Unconnected parts are laid out side by side.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,14 @@ from scipy.spatial import cKDTree
 from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
 from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
-from processing.pieces import SolvedPiece, bend_to
-from processing.pose_graph import Links
+from processing.pieces import SolvedPiece
+from processing.pose_graph import Links, Solution, solve
 from processing.registration import register_passes
+from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
 from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
+from processing.workers import Workers
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -96,17 +99,16 @@ def find_boundary(solved: list[SolvedPiece]) -> Boundary:
     return boundary
 
 
-def condense_all(solved: list[SolvedPiece], boundary: Boundary) -> list[Condensed]:
-    return [
-        condense(
-            piece.map.poses,
-            piece.map.links,
-            piece.map.solution.weights,
-            np.array(boundary.indices[p], np.int64),
-            np.array(boundary.variables[p], np.int64),
-        )
-        for p, piece in enumerate(solved)
-    ]
+def condense_all(solved: list[SolvedPiece], boundary: Boundary, work: Workers) -> list[Condensed]:
+    maps = [piece.map for piece in solved]
+    return work.starmap(
+        "assembly",
+        condense,
+        [
+            (of.poses, of.links, of.solution.weights, np.array(indices, np.int64), np.array(variables, np.int64))
+            for of, indices, variables in zip(maps, boundary.indices, boundary.variables, strict=True)
+        ],
+    )
 
 
 def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
@@ -131,38 +133,80 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 
-def link_overlaps(
-    solved: list[SolvedPiece], boundary: Boundary, frames: list[Array], parts: list[int], match: Matcher
-) -> Links:
-    """Links between key frames of different pieces that lie over each other; their key frames join the boundary."""
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Key frames of two pieces that lie over each other, k pairs of them."""
+
+    pieces: tuple[SolvedPiece, SolvedPiece]
+    numbers: tuple[int, int]  # of the pieces
+    indices: list[tuple[int, int]]  # k
+    guesses: list[Array]  # k of (3,): the second seen from the first
+
+    def match(self, match: Matcher) -> list[ScanMatch]:
+        """k matches, of the vehicle."""
+        p, q = self.pieces
+        return [
+            match_vehicles(p.scan(i), q.scan(k), guess, q.input.mount, match)
+            for (i, k), guess in zip(self.indices, self.guesses, strict=True)
+        ]
+
+
+def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int]) -> list[Overlap]:
     poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
     trees = [cKDTree(of[:, :2]) for of in poses]
     low = np.array([of[:, :2].min(axis=0) for of in poses]) - OVERLAP_M
     high = np.array([of[:, :2].max(axis=0) for of in poses])
-    ends, motions, informations = [], [], []
+    found = []
     for q in range(len(solved)):
         for p in np.flatnonzero(np.all(low[:q] < high[q], axis=1) & np.all(low[q] < high[:q], axis=1)):
             if parts[p] != parts[q]:
                 continue
             distance, near = trees[p].query(poses[q][:, :2], distance_upper_bound=OVERLAP_M)
-            last = np.full(2, np.inf)
+            last, overlap = np.full(2, np.inf), Overlap((solved[p], solved[q]), (int(p), q), [], [])
             for k in np.flatnonzero(np.isfinite(distance)):
                 if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
                     continue
                 i, last = int(near[k]), poses[q][k, :2]
-                guess = relative(poses[p][i], poses[q][k])
-                found = match_vehicles(solved[p].scan(i), solved[q].scan(int(k)), guess, solved[q].input.mount, match)
-                if worth_a_link(found, LOOP_INLIERS):
-                    ends.append((boundary.add(int(p), i), boundary.add(q, int(k))))
-                    motions.append(found.motion)
-                    informations.append(np.linalg.inv(blur(found.covariance)))
+                overlap.indices.append((i, int(k)))
+                overlap.guesses.append(relative(poses[p][i], poses[q][k]))
+            found += [overlap] * bool(overlap.indices)
+    return found
+
+
+def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers) -> Links:
+    """Links between the key frames of overlaps, which join the boundary."""
+    ends, motions, informations = [], [], []
+    matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps)
+    for overlap, found in zip(overlaps, matches, strict=True):
+        (p, q) = overlap.numbers
+        for (i, k), seen in zip(overlap.indices, found, strict=True):
+            if worth_a_link(seen, LOOP_INLIERS):
+                ends.append((boundary.add(p, i), boundary.add(q, k)))
+                motions.append(seen.motion)
+                informations.append(np.linalg.inv(blur(seen.covariance)))
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 
-def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher) -> Placement:
+def bend(
+    solved: list[SolvedPiece], boundary: Boundary, poses: Array, frames: list[Array], work: Workers
+) -> list[SolvedPiece]:
+    """Solve the pieces again with their boundary where the assembly has put it; they come out in the atlas frame."""
+    tasks = []
+    for piece, indices, variables, frame in zip(solved, boundary.indices, boundary.variables, frames, strict=True):
+        guess, fixed = compose(frame, piece.map.poses), np.zeros(len(piece.map.poses), bool)
+        guess[indices], fixed[indices] = poses[variables], True
+        tasks.append((guess, piece.map.links, fixed))
+    solutions: list[Solution] = work.starmap("assembly", solve, tasks)
+    return [
+        replace(piece, map=replace(piece.map, poses=found.poses, solution=found))
+        for piece, found in zip(solved, solutions, strict=True)
+    ]
+
+
+def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers) -> Placement:
     """The refined assembly: least squares of all that the pieces know of each other, then the pieces bent to fit."""
     boundary = find_boundary(solved)
-    condensed = condense_all(solved, boundary)
+    condensed = condense_all(solved, boundary, work)
     links = link_nodes(solved, boundary)
     poses, part, frames = lay_out(condensed, links, boundary.count)
     poses, _ = solve_frames(poses, condensed, links, _first_of_each(part))
@@ -170,16 +214,13 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher) -> 
     parts = [int(part[piece.variables[0]]) for piece in condensed]
     for _ in range(OVERLAP_ROUNDS):
         grown = find_boundary(solved)
-        more = links + link_overlaps(solved, grown, frames, parts, match)
-        condensed = condense_all(solved, grown)
+        more = links + link_overlaps(find_overlaps(solved, frames, parts), grown, match, work)
+        condensed = condense_all(solved, grown, work)
         poses, part, _ = lay_out(condensed, more, grown.count)
         poses, weights = solve_frames(poses, condensed, more, _first_of_each(part))
         frames, boundary = [fit_frame(piece, poses) for piece in condensed], grown
         parts = [int(part[piece.variables[0]]) for piece in condensed]
-    bent = [
-        bend_to(piece, np.array(indices), poses[variables], compose(frame, piece.map.poses))
-        for piece, indices, variables, frame in zip(solved, boundary.indices, boundary.variables, frames, strict=True)
-    ]
+    bent = bend(solved, boundary, poses, frames, work)
     doubted = int((weights < 0.1).sum())
     notes = [f"{doubted} of {len(more)} links between pieces contradict the rest and were left out"] if doubted else []
     return _settle(bent, parts, boundary, poses, graph, notes)

@@ -16,6 +16,7 @@ from processing.geometry import compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece
 from processing.scan_matching import Matcher
+from processing.workers import Workers
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -24,7 +25,7 @@ Key = tuple[int, int]  # of a pass: run, scan
 SHORT_M = 2.0  # two tags this close are one node of the assembly: the centres of their clouds jitter by as much
 
 
-def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher) -> Placement:
+def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher, _work: Workers) -> Placement:
     """The paper's assembly of all edges; spurs are hung on what they share a pass with, or else a tag.
 
     So are edges too short to have a direction: two tags on one bolt are one node, and a drive by them one turn.

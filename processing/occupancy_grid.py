@@ -15,6 +15,7 @@ those of the part, so that no turn leaves holes.
 Limit: a grid is dense; memory follows its bounding box, 8 bytes a cell while it is built. Many grids wait in files.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,7 +197,16 @@ def _resample(
 ) -> None:
     height, width = part.shape
     for row in range(first[1], last[1]):
-        for column in range(first[0], last[0]):
+        low, high = first[0], last[0]
+        for at, step, size in (
+            (start[0] - turn[1] * row, turn[0], width),
+            (start[1] + turn[0] * row, turn[1], height),
+        ):
+            if abs(step) > 1e-9:  # where this row enters the part, and where it leaves it
+                enter, leave = (-1.0 - at) / step, (size - at) / step
+                low = max(low, math.floor(min(enter, leave)))
+                high = min(high, math.ceil(max(enter, leave)) + 1)
+        for column in range(low, high):
             x = start[0] + turn[0] * column - turn[1] * row
             y = start[1] + turn[1] * column + turn[0] * row
             left, below = int(np.floor(x + 1e-6)), int(np.floor(y + 1e-6))
@@ -207,6 +217,13 @@ def _resample(
                 u = 0.0
             if v < 1e-6:
                 v = 0.0
+            if (
+                0 <= left < width - 1
+                and 0 <= below < height - 1
+                and part[below, left] == part[below, left + 1] == 0
+                and part[below + 1, left] == part[below + 1, left + 1] == 0
+            ):
+                continue
             value = 0.0
             for i, weight_y in ((below, 1.0 - v), (below + 1, v)):
                 for j, weight_x in ((left, 1.0 - u), (left + 1, u)):

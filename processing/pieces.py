@@ -15,7 +15,6 @@ from processing.geometry import compose
 from processing.graph import Piece, Span
 from processing.occupancy_grid import Grid, build_grid
 from processing.open_loop import OpenLoop
-from processing.pose_graph import solve
 from processing.registration import path_starts
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
@@ -112,16 +111,6 @@ def rename(parts: list[SolvedPiece], name: str) -> list[SolvedPiece]:
 
 def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:
     return [SolvedPiece(part, map_piece(list(part.paths), part.mount, match)) for part in split_drifts(given)]
-
-
-def bend_to(solved: SolvedPiece, boundary: Ints, boundary_poses: Array, first_guess: Array) -> SolvedPiece:
-    """Solve a piece again with its boundary where the assembly has put it; the piece comes out in the atlas frame."""
-    poses = first_guess.copy()
-    poses[boundary] = boundary_poses
-    fixed = np.zeros(len(poses), bool)
-    fixed[boundary] = True
-    solution = solve(poses, solved.map.links, fixed)
-    return SolvedPiece(solved.input, replace(solved.map, poses=solution.poses, solution=solution))
 
 
 def draw_piece(given: PieceInput, firsts: Ints, poses: Array, resolution_m: float) -> Grid:

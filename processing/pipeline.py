@@ -115,7 +115,7 @@ def map_network(
         inputs = [piece_input(names[piece], piece, runs) for piece in new]
         known |= dict(zip(new, work.map("pieces", partial(solve_piece, match=match), inputs), strict=True))
         solved = [part for piece in graph.pieces for part in rename(known[piece], names[piece])]
-        placed = place(solved, graph, match)
+        placed = place(solved, graph, match, work)
         reviewed = add_missed(runs, placed, match)
         if reviewed is None or review == MAX_REVIEWS:
             break

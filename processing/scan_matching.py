@@ -30,6 +30,7 @@ PRETENCE = 3.0  # information less than so many times what noisy normals pretend
 SETTLED = 0.05  # standard deviations: steps smaller than this do not matter
 MIN_MATCHED = 10  # points, and
 MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
+COARSE = 3  # while pairs may be further apart than the next, every third point says enough
 CLOSEST_M = 0.25  # pairs of points further apart than this are no pairs, once the guess has become good
 LEVER_M = 5.0  # a typical distance to the walls
 MODEL_NOISE_M = 0.001  # what matching on other points of a rough wall leaves, however many beams see it
@@ -132,11 +133,12 @@ def _gauss_newton(
     scale = np.outer(lever, lever)
     for iteration in range(max_iterations):
         reach = max(reach_m * 0.6**iteration, CLOSEST_M)
+        every = COARSE if reach > CLOSEST_M else 1
         c, s = math.cos(motion[2]), math.sin(motion[2])
         visible = matched = 0
         g0 = g1 = g2 = i00 = i01 = i02 = i11 = i12 = i22 = f00 = f01 = f02 = f11 = f12 = f22 = 0.0
         sum_squares = sum_weights = 0.0
-        for i in on_walls:
+        for i in on_walls[::every]:
             px, py = points[i, 0], points[i, 1]
             rx, ry = c * px - s * py, s * px + c * py
             x, y = rx + motion[0], ry + motion[1]
@@ -171,7 +173,7 @@ def _gauss_newton(
             doubt = weight * ref_variances[best, 1]
             f00, f01, f02 = f00 + doubt * my * my, f01 - doubt * my * mx, f02 - doubt * my * slide
             f11, f12, f22 = f11 + doubt * mx * mx, f12 + doubt * mx * slide, f22 + doubt * slide * slide
-        if matched < max(MIN_MATCHED, MIN_OVERLAP * valid):
+        if every * matched < max(MIN_MATCHED, MIN_OVERLAP * valid):
             break
         gradient = np.array([g0, g1, g2])
         information = np.array([[i00, i01, i02], [i01, i11, i12], [i02, i12, i22]])

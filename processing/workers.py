@@ -6,11 +6,12 @@ SIGTERM or an error, the processes end at once and without a word.
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import partial
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from tqdm import tqdm
 
@@ -26,6 +27,10 @@ class Workers:
     def __init__(self, jobs: int) -> None:
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(jobs, context) if jobs > 1 else None
+        if self._pool is not None:
+            with _deaf_children():
+                for _ in range(jobs):
+                    self._pool.submit(_load)  # while the first recording is read
 
     def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Raises: RTLogError: a process died; whatever `function` raises."""
@@ -33,16 +38,16 @@ class Workers:
         bar = partial(tqdm, total=len(items), desc=label, disable=None, leave=False)
         if self._pool is None or len(items) < 2:
             return [function(item) for item in bar(items)]
-        # A terminal sends Ctrl-C to every process of a program, and one answers: the others are born deaf to it.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            results = self._pool.map(function, items)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        try:
+            with _deaf_children():
+                results = self._pool.map(function, items)
             return list(bar(results))
         except BrokenProcessPool as error:
             raise RTLogError("a process died, perhaps for want of memory; try fewer --jobs") from error
+
+    def starmap(self, label: str, function: Callable[..., Result], items: Iterable[tuple[Any, ...]]) -> list[Result]:
+        """The same; every item holds all arguments."""
+        return self.map(label, partial(_apply, function), items)
 
     def __enter__(self) -> Self:
         return self
@@ -54,3 +59,22 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.kill()
         self._pool.shutdown(cancel_futures=True)
+
+
+def _apply(function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result:
+    return function(*arguments)
+
+
+def _load() -> None:
+    """What a process needs to begin."""
+    import processing.pipeline  # noqa: F401  (here, for it imports this module)
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """A terminal sends Ctrl-C to every process of a program, and one answers: those born in here are deaf to it."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -16,6 +16,7 @@ from processing.occupancy_grid import Grid
 from processing.pieces import SolvedPiece, draw_piece
 from processing.pipeline import DrivenRun, remarks
 from processing.scan_matching import match_scans
+from processing.workers import Workers
 
 Solve = Callable[[list[DrivenRun]], tuple[Graph, list[SolvedPiece]]]
 Move = Callable[[list[Placed], list[DrivenRun]], tuple[np.ndarray, np.ndarray]]
@@ -36,7 +37,7 @@ def renamed(of: DrivenRun) -> DrivenRun:
 @pytest.fixture(scope="module")
 def placement(solved: Solved) -> Placement:
     graph, pieces = solved
-    return place_by_frames(pieces, graph, match_scans)
+    return place_by_frames(pieces, graph, match_scans, Workers(1))
 
 
 def test_walls_are_stitched_within_two_cells_of_the_true_ones(
@@ -44,7 +45,7 @@ def test_walls_are_stitched_within_two_cells_of_the_true_ones(
 ) -> None:
     """Without noise, all pieces drawn where they were placed: no cell of a wall further off than that."""
     graph, solved = solve_runs(driven_clean)
-    placement = place_by_frames(solved, graph, match_scans)
+    placement = place_by_frames(solved, graph, match_scans, Workers(1))
     into_world, off = move_into_world(placement.pieces, driven_clean)
     assert off.max() < 0.03
     walls = np.loadtxt(small_world / "walls.csv", delimiter=",", skiprows=1)
@@ -119,7 +120,7 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     """The same mine, but the second run read other tags: nothing may be joined, and the user is told."""
     runs = [driven[0], renamed(driven[1])]
     graph, pieces = solve_runs(runs)
-    placement = place_by_frames(pieces, graph, match_scans)
+    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
     assert len(placement.remarks) == 1
     assert "2 unconnected parts" in placement.remarks[0]
     extents = []
@@ -143,7 +144,7 @@ def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
     epc = sorted({found.epc for found in driven[0].passes})[tag]
     one = next(found for found in driven[other].passes if found.epc == epc)
     graph, pieces = solve_runs([replace(of, passes=[one]) if k == other else of for k, of in enumerate(driven)])
-    placement = place_by_frames(pieces, graph, match_scans)
+    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
     assert {piece.part for piece in placement.pieces} == {0}
     assert placement.remarks == []
     assert move_into_world(placement.pieces, driven)[1].max() < 0.1
@@ -154,7 +155,7 @@ def test_a_run_without_tags_is_mapped_alone_and_told(
 ) -> None:
     runs = [driven[0], replace(driven[1], passes=[])]
     graph, pieces = solve_runs(runs)
-    placement = place_by_frames(pieces, graph, match_scans)
+    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
     (alone,) = [piece for piece in placement.pieces if piece.solved.input.piece.i is None]
     assert [piece.part for piece in placement.pieces if piece is not alone] == [1 - alone.part] * (len(pieces) - 1)
     assert move_into_world([alone], driven)[1].max() < 0.1
@@ -165,7 +166,7 @@ def test_a_run_without_tags_is_mapped_alone_and_told(
 
 def test_no_run_with_a_tag_still_makes_a_map(driven: list[DrivenRun], solve_runs: Solve) -> None:
     graph, pieces = solve_runs([replace(driven[1], passes=[])])
-    placement = place_by_frames(pieces, graph, match_scans)
+    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
     assert graph.nodes == ()
     assert placement.nodes.shape == (0, 3)
     (alone,) = placement.pieces
@@ -187,7 +188,7 @@ def test_a_stretched_piece_gives_way_to_its_neighbours(
     ends = weak.ends
     stretched = replace(weak, motions=relative(poses[ends[:, 0]], poses[ends[:, 1]]))
     bent = replace(piece, map=replace(piece.map, poses=poses, links=stretched))
-    placement = place_by_frames([*pieces[:chosen], bent, *pieces[chosen + 1 :]], graph, match_scans)
+    placement = place_by_frames([*pieces[:chosen], bent, *pieces[chosen + 1 :]], graph, match_scans, Workers(1))
     stretch = np.hypot(*(poses - piece.map.poses)[:, :2].T).max()
     assert stretch > 0.5
     others = [placed for placed in placement.pieces if placed.solved.input is not piece.input]

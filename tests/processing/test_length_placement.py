@@ -14,6 +14,7 @@ from processing.length_placement import _find_hold, place_by_lengths
 from processing.pieces import SolvedPiece
 from processing.pipeline import DrivenRun
 from processing.scan_matching import match_scans
+from processing.workers import Workers
 
 Solve = Callable[[list[DrivenRun]], tuple[Graph, list[SolvedPiece]]]
 Move = Callable[[list[Placed], list[DrivenRun]], tuple[np.ndarray, np.ndarray]]
@@ -36,7 +37,7 @@ def scale(piece: SolvedPiece, by: float) -> SolvedPiece:
 @pytest.fixture(scope="module")
 def placement(solved: Solved) -> Placement:
     graph, pieces = solved
-    return place_by_lengths(pieces, graph, match_scans)
+    return place_by_lengths(pieces, graph, match_scans, Workers(1))
 
 
 def test_all_pieces_hang_together_where_they_truly_lie(
@@ -54,7 +55,7 @@ def test_without_noise_the_kinks_are_gone(
     driven_clean: list[DrivenRun], solve_runs: Solve, move_into_world: Move
 ) -> None:
     graph, pieces = solve_runs(driven_clean)
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     assert placement.remarks == []
     _, off = move_into_world(placement.pieces, driven_clean)
     assert off.max() < 0.15
@@ -112,7 +113,7 @@ def test_a_length_that_cannot_hold_is_named(
     longest = max(edges, key=lambda k: length(pieces[k].map.poses, pieces[k]))
     others = sum(length(pieces[k].map.poses, pieces[k]) for k in edges if k != longest)
     steep = [scale(p, 2 * others / length(p.map.poses, p)) if k == longest else p for k, p in enumerate(pieces)]
-    (remark,) = place_by_lengths(steep, graph, match_scans).remarks
+    (remark,) = place_by_lengths(steep, graph, match_scans, Workers(1)).remarks
     assert pieces[longest].input.name in remark
     assert "cannot all hold" in remark
 
@@ -132,7 +133,7 @@ def test_tags_on_one_bolt_bend_nothing(
         doubled.append(replace(of, passes=sorted(passes, key=lambda found: found.centre)))
     graph, pieces = solve_runs(doubled)
     assert len(graph.nodes) == 8
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     assert {piece.part for piece in placement.pieces} == {0}
     _, off = move_into_world(placement.pieces, driven)
     assert np.sqrt(np.mean(off**2)) < 1.0
@@ -143,7 +144,7 @@ def test_runs_without_a_common_tag_are_parts_side_by_side_and_told(
 ) -> None:
     passes = [replace(found, epc=found.epc.replace("E2003412", "E2009999")) for found in driven[1].passes]
     graph, pieces = solve_runs([driven[0], replace(driven[1], passes=passes)])
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     spans = [{span.run for span in piece.solved.input.piece.spans} for piece in placement.pieces]
     assert [{piece.part} for piece in placement.pieces] == spans  # run 0 is part 0, run 1 part 1
     assert any("2 unconnected parts" in remark for remark in placement.remarks)
@@ -159,7 +160,7 @@ def test_a_run_with_one_tag_is_one_part(driven: list[DrivenRun], solve_runs: Sol
     assert len(one) == 2
     graph, pieces = solve_runs([replace(driven[0], passes=one)])
     assert len(pieces) == 3
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     assert {piece.part for piece in placement.pieces} == {0}
     assert placement.remarks == []
     assert move_into_world(placement.pieces, driven)[1].max() < 1.0
@@ -174,7 +175,7 @@ def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
     epc = sorted({found.epc for found in driven[0].passes})[tag]
     one = next(found for found in driven[other].passes if found.epc == epc)
     graph, pieces = solve_runs([replace(of, passes=[one]) if k == other else of for k, of in enumerate(driven)])
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     assert {piece.part for piece in placement.pieces} == {0}
     assert placement.remarks == []
     assert move_into_world(placement.pieces, driven)[1].max() < 0.8
@@ -182,7 +183,7 @@ def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
 
 def test_a_run_without_tags_is_placed_alone(driven: list[DrivenRun], solve_runs: Solve) -> None:
     graph, pieces = solve_runs([replace(driven[1], passes=[])])
-    placement = place_by_lengths(pieces, graph, match_scans)
+    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
     assert placement.nodes.shape == (0, 3)
     assert [piece.part for piece in placement.pieces] == [0]
     assert_allclose(placement.pieces[0].edge_poses[0], 0, atol=1e-12)
