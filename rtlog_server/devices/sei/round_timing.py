@@ -9,7 +9,7 @@ period old at the next; so the lead follows the slowest of the last rounds, up t
 """
 
 SMOOTHING = 8  # rounds over which the length of a round is averaged
-FORGETTING = 16  # rounds in which the slowest of them loses two thirds of its weight
+FORGETTING = 128  # rounds in which the slowest of them loses two thirds of its weight
 FIRST_LATE_NS = 2_000_000
 MAX_LATE_NS = 8_000_000  # what comes later than this costs its tick
 SAFETY_NS = 500_000
