@@ -3,15 +3,20 @@
 import contextlib
 import json
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
 
 import numpy as np
 import pytest
 import zenoh
 
+from rtlog_client.compare import Comparison, compare_recordings
+from rtlog_client.replay_report import ReplayReport
 from rtlog_server.attachment import pack_attachment
 from rtlog_server.messages import (
     OK,
@@ -27,6 +32,9 @@ from rtlog_server.messages import (
     to_time,
 )
 from rtlog_server.topics import DIAGNOSTICS, JOINT_STATES, PRIMARY_SCAN, TAGS, TICK
+
+sys.path.insert(0, str(Path(__file__).parent))
+from compared_drive import OFFSET, Rows, report, rows, write
 
 START_NS = 1_770_000_000_000_000_000
 PERIOD_NS = 100_000_000
@@ -201,3 +209,17 @@ def bench() -> type[BenchServer]:
 @pytest.fixture
 def free_port() -> int:
     return find_free_port()
+
+
+@pytest.fixture
+def compare(tmp_path: Path) -> Callable[..., Comparison]:
+    """compare(change, told): changes what came out and compares."""
+    write(tmp_path / "in.mcap", rows(), 0)
+
+    def run(change: Callable[[Rows], object], told: ReplayReport | None = None, **more: Any) -> Comparison:
+        came_out = rows(OFFSET, turns=3)  # of the right wheel, which stands elsewhere in its turn when it is found
+        change(came_out)
+        write(tmp_path / "out.mcap", came_out, OFFSET, **more)
+        return compare_recordings(tmp_path / "in.mcap", tmp_path / "out.mcap", told or report())
+
+    return run

@@ -4,14 +4,10 @@ import json
 import logging
 import os
 import shutil
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +17,6 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from hw_profiles.errors import BadInputError, RTLogError
-from rtlog_client.cli import main
 from rtlog_client.log_file import LOSS_NAME, read_info, read_messages
 from rtlog_client.record import record
 from rtlog_client.recorder import Progress, RecordConfig
@@ -225,14 +220,15 @@ def test_a_disk_that_fills_up_leaves_a_finished_file(
 ) -> None:
     server = start_server()
     free = shutil.disk_usage(tmp_path).free
+    margin = min(2 * 10**9, free // 4)  # more than other programs write or delete meanwhile
     ballast = tmp_path / "ballast"
-    recording = start_recording(server.endpoint, name="run", reserve_bytes=free - 30_000_000)
+    recording = start_recording(server.endpoint, name="run", reserve_bytes=free - margin)
     server.wait_for_subscriber()
     for k in range(20):
         server.tick(k)
     recording.wait(lambda progress: progress.ticks == 20)
     with ballast.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, 60_000_000)
+        os.posix_fallocate(file.fileno(), 0, 2 * margin)
     with pytest.raises(RTLogError, match="the disk is full"):
         recording.future.result(10)
     ballast.unlink()
@@ -265,48 +261,3 @@ def test_several_vehicles_are_named(start_server: StartServer, tmp_path: Path) -
     server.declare_presence("two")
     with pytest.raises(BadInputError, match=r"several vehicles .*: one, two"):
         record(RecordConfig(tmp_path, server.endpoint), threading.Event())
-
-
-@contextmanager
-def record_command(server: Any, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "rtlog_client.cli", "record", "-o", str(folder), "--connect", server.endpoint]
-    pipe = subprocess.PIPE
-    with subprocess.Popen([*command, *options], stdout=pipe, stderr=pipe, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def record_30_ticks(server: Any, process: subprocess.Popen[str]) -> None:
-    """Returns when the process has told that it has synced them."""
-    assert process.stderr is not None
-    server.wait_for_subscriber()
-    for k in range(30):
-        server.tick(k)
-    assert any(line.startswith("30 ticks  0 lost") for line in process.stderr)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_finished_file(start_server: StartServer, tmp_path: Path, number: signal.Signals) -> None:
-    server = start_server()
-    with record_command(server, tmp_path, "--json") as process:
-        record_30_ticks(server, process)
-        process.send_signal(number)
-        output, _ = process.communicate(timeout=10)
-    assert process.returncode == 0
-    [summary] = json.loads(output)
-    assert summary["ticks"] == 30
-    assert summary["lost"] == {}
-    assert [str(p) for p in tmp_path.iterdir()] == [summary["path"]]
-    assert summary["path"].endswith("Z_bench.mcap")
-    assert read_info(Path(summary["path"])).message_counts[TICK.name] == 30
-
-
-def test_a_killed_recording_gives_back_what_was_synced(start_server: StartServer, tmp_path: Path) -> None:
-    server = start_server()
-    with record_command(server, tmp_path, "--name", "run") as process:
-        record_30_ticks(server, process)
-        process.kill()
-    assert main(["recover", str(tmp_path / "run.mcap.part")]) == 0
-    assert read_info(tmp_path / "run.mcap").message_counts[TICK.name] == 30
