@@ -18,6 +18,8 @@ from processing.simulation.simulate import simulate
 from processing.tum import read_tum
 from processing.workers import Workers
 
+sys.path.insert(0, str(Path(__file__).parent))  # the helpers beside the tests
+
 SMALL_WORLD = """
 schema = 1
 name = "small"

@@ -1,107 +1,38 @@
 """Recordings of ours and of others, whole and damaged, as arrays."""
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from recorded_drive import (
+    NOTHING,
+    TICKS,
+    TRAILER,
+    Message,
+    drive,
+    joints,
+    odom,
+    ours,
+    scan,
+    tags,
+    theirs,
+    tick_ns,
+)
 
 from hw_profiles.errors import BadInputError
-from hw_profiles.profile import load_profile, parse_profile, read_profile_text
-from processing.read_log import read_log, rising_stamps
+from hw_profiles.profile import load_profile, parse_profile
+from processing.read_log import read_log
 from rtlog_client.log_file import LogWriter
 from rtlog_server.messages import (
     JointState,
-    LaserScan,
-    Odometry,
-    TagRead,
-    TagReads,
-    Tick,
     encode,
     header,
-    to_time,
-    typestore,
 )
 
-START_NS = 1_767_592_800_000_000_000
-TICKS = 20
-LMS111 = (np.radians(-135), np.radians(0.5))  # angle_min, angle_increment
-TRAILER = read_profile_text("canmet_trailer")
-NOTHING = np.empty(0)
-Message = tuple[str, int, object]  # topic, log time, message
 Record = Callable[..., Path]
-
-
-def tick_ns(k: int) -> int:
-    return START_NS + k * 100_000_000
-
-
-def scan(stamp_ns: int, ranges: Iterable[float], angles: tuple[float, float] = LMS111) -> object:
-    values = np.array(ranges, np.float32)
-    return LaserScan(
-        header=header(stamp_ns, "laser"),
-        angle_min=angles[0],
-        angle_max=angles[0] + angles[1] * (len(values) - 1),
-        angle_increment=angles[1],
-        time_increment=2e-5,
-        scan_time=0.02,
-        range_min=0.05,
-        range_max=20.0,
-        ranges=values,
-        intensities=np.float32(NOTHING),
-    )
-
-
-def joints(stamp_ns: int, **angles: float) -> object:
-    return JointState(header(stamp_ns, ""), list(angles), np.array(list(angles.values())), NOTHING, NOTHING)
-
-
-def odom(stamp_ns: int, x: float, y: float, heading: float) -> object:
-    types, zeros = typestore.types, np.zeros(36)
-    still = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(heading / 2), w=np.cos(heading / 2)),
-    )
-    return Odometry(
-        header=header(stamp_ns, "odom"),
-        child_frame_id="base_link",
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=zeros),
-        twist=types["geometry_msgs/msg/TwistWithCovariance"](
-            twist=types["geometry_msgs/msg/Twist"](linear=still, angular=still), covariance=zeros
-        ),
-    )
-
-
-def tags(stamp_ns: int, *reads: tuple[int, str]) -> object:
-    return TagReads(header(stamp_ns, "rfid"), [TagRead(to_time(ns), epc, 0, 1, -40.0) for ns, epc in reads])
-
-
-def ours(k: int) -> list[Message]:
-    """What our server sends at tick k: the scan was taken 30 ms before it, the wheels latched 12 ms before it."""
-    now = tick_ns(k)
-    return [
-        ("/rtlog/tick", now, Tick(header(now + 9_000, ""), k, to_time(now), 9e-6, [])),
-        ("/laser/primary/scan", now, scan(now - 30_000_000, np.full(541, 4.0 + 0.1 * k))),
-        ("/encoders/joint_states", now, joints(now - 12_000_000, left_wheel=0.5 * k, right_wheel=0.6 * k)),
-        ("/rfid/tags", now, tags(now, (now - 40_000_000, "e2003412000000000000000a")) if k == 7 else tags(now)),
-    ]
-
-
-def theirs(k: int) -> list[Message]:
-    """Another system: /scan of 181 beams over 180°, /odom at other moments, no ticks."""
-    now, angles = tick_ns(k), (-np.pi / 2, np.pi / 180)
-    return [
-        ("/odom", now, odom(now - 5_000_000, 0.2 * k, 0.1 * k, 0.4 * k - 3.0)),
-        ("/scan", now, scan(now, np.full(181, 3.0), angles)),
-    ]
-
-
-def drive(tick: Callable[[int], list[Message]], but: Callable[[str, int], bool] = lambda _topic, _k: False) -> list:
-    """All ticks' messages, without those that `but` names."""
-    return [m for k in range(TICKS) for m in tick(k) if not but(m[0], k)]
 
 
 @pytest.fixture
@@ -244,36 +175,6 @@ def test_stamps_that_run_backwards_keep_their_order(record: Record) -> None:
     since_wheels = run.scans.times - run.motion_times
     assert_allclose(since_wheels[sound], -0.018, atol=1e-9)  # the others are where they were
     assert_allclose(since_wheels[list(back)], -0.018, atol=1e-6)  # and these where the order puts them
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_stamps_rise_whatever_the_clock_does(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    stamps = START_NS + np.cumsum(rng.integers(-40_000_000, 100_000_000, 500)).astype(np.int64)
-    stamps[rng.integers(0, 500, 30)] = stamps[rng.integers(0, 500)]
-    rising = rising_stamps(stamps)
-    assert np.all(np.diff(rising) > 0)
-    assert rising.dtype == np.int64
-
-
-def test_sound_stamps_are_taken_at_their_word() -> None:
-    rng = np.random.default_rng(1)
-    stamps = START_NS + np.cumsum(rng.integers(1, 90_000_000, 300)).astype(np.int64)
-    assert_array_equal(rising_stamps(stamps), stamps)
-    wrong = rng.choice(300, 30, replace=False)  # also the first, the last and neighbours
-    wrong[:3] = [0, 299, wrong[4] + 1]
-    ran_away = stamps.copy()
-    ran_away[wrong] += rng.choice([-1, 1], 30) * 3_600_000_000_000  # an hour, either way
-    sound = np.setdiff1d(np.arange(300), wrong)
-    assert_array_equal(rising_stamps(ran_away)[sound], stamps[sound])
-
-
-def test_stamps_in_doubt_keep_the_pace() -> None:
-    even = START_NS + 100_000_000 * np.arange(20)
-    wrong = even.copy()
-    wrong[[0, 7, 8, 18, 19]] = START_NS + np.array([9_000_000_000, 0, 0, 1, 0])
-    assert_array_equal(rising_stamps(wrong), even)
-    assert_array_equal(rising_stamps(even[:1]), even[:1])
 
 
 def test_a_scan_with_the_stamp_of_an_odometry_message_belongs_to_it(record: Record) -> None:
