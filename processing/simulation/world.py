@@ -139,11 +139,6 @@ def read_world_text(name_or_path: str | Path) -> str:
         raise BadInputError(f"world {name_or_path}: not UTF-8 text (byte {error.start})") from error
 
 
-def load_world(name_or_path: str | Path) -> World:
-    """Read and check a world. Raises: BadInputError with the file, the key and what is wrong with it."""
-    return parse_world(read_world_text(name_or_path), source=str(name_or_path))
-
-
 def parse_world(text: str, source: str) -> World:
     """Check a world's TOML; `source` names it in errors. Raises: BadInputError."""
     world = parse_toml(text, World, f"world {source}")

@@ -13,7 +13,7 @@ from hw_profiles.errors import BadInputError
 from hw_profiles.profile import load_profile
 from processing.simulation import simulate as simulate_module
 from processing.simulation.simulate import build_drive, build_space, clearance, simulate
-from processing.simulation.world import load_world
+from processing.simulation.world import parse_world, read_world_text
 from rtlog_client.log_file import read_info, read_messages
 from rtlog_server.messages import decode, to_ns
 
@@ -241,7 +241,7 @@ SHIPPED = {
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_worlds_are_what_they_say(name: str) -> None:
-    world, said = load_world(name), SHIPPED[name]
+    world, said = parse_world(read_world_text(name), name), SHIPPED[name]
     lines = [shapely.LineString([world.point(place) for place in drift.points]) for drift in world.drifts]
     assert sum(line.length for line in lines) == pytest.approx(said.drifts_m, abs=1)
     assert (len(world.tags), len(world.runs)) == (said.tags, said.runs)

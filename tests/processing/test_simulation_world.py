@@ -3,7 +3,7 @@
 import pytest
 
 from hw_profiles.errors import BadInputError
-from processing.simulation.world import load_world, parse_world, route, shipped_worlds, without_noise
+from processing.simulation.world import parse_world, read_world_text, route, shipped_worlds, without_noise
 
 WORLD = """
 schema = 1
@@ -71,7 +71,7 @@ def test_two_runs_of_one_name_are_refused() -> None:
 
 def test_a_missing_world_names_the_shipped_ones() -> None:
     with pytest.raises(BadInputError, match=r"world nowhere: .*shipped worlds are demo, .*loop, "):
-        load_world("nowhere")
+        read_world_text("nowhere")
 
 
 def test_the_way_between_two_places_follows_the_drift() -> None:
@@ -95,7 +95,7 @@ def test_a_choice_of_two_drifts_is_refused_unless_one_is_direct() -> None:
 
 
 def test_without_noise_only_the_sensors_change() -> None:
-    world = load_world("demo")
+    world = parse_world(read_world_text("demo"), "demo")
     quiet = without_noise(world)
     assert quiet.noise.range_m == quiet.noise.slip_m_per_sqrt_m == quiet.noise.missed_pass_probability == 0.0
     assert not quiet.noise.wheel_radius_error_percent
@@ -104,4 +104,4 @@ def test_without_noise_only_the_sensors_change() -> None:
 
 def test_every_shipped_world_is_sound() -> None:
     assert {"demo", "loop", "mine_level", "missed_tag", "moved_tags", "straight", "tunnels"} < set(shipped_worlds())
-    assert all(load_world(name).name == name for name in shipped_worlds())
+    assert all(parse_world(read_world_text(name), name).name == name for name in shipped_worlds())
