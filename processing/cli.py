@@ -167,6 +167,10 @@ def _import(args: argparse.Namespace) -> None:
     print(f"{args.output}: {counts.scans} scans, {counts.odometry} poses of odometry")
     for kind, lines in counts.skipped.items():
         print(f"rtlog-atlas: {lines} lines of {kind} are left out", file=sys.stderr)
+    if counts.backward_stamps:
+        print(f"rtlog-atlas: {counts.backward_stamps} lines are stamped earlier than the one before", file=sys.stderr)
+    if counts.spread_stamps:
+        print(f"rtlog-atlas: {counts.spread_stamps} lines had rounded stamps and are spread out", file=sys.stderr)
 
 
 if __name__ == "__main__":

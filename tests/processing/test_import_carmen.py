@@ -1,6 +1,8 @@
 """CARMEN logs become recordings: stamps, angles, units and special ranges as the logs mean them."""
 
 import gzip
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +89,20 @@ def test_rounded_stamps_are_spread_in_order(tmp_path: Path) -> None:
     # 0.2 s hold four instants, the scan being one with its ODOM line; the gap of 94.8 s is filled no wider than 0.1 s
     assert_allclose(got, [5, 5.05, 5.1, 5.15, 5.2, 5.3, 5.4, 5.5, 100, 100.1])
     assert counts.spread_stamps == 8
+
+
+@pytest.mark.parametrize(
+    ("stamps", "told"),
+    [
+        (["5", "6", "5.9"], "1 lines are stamped earlier than the one before"),
+        (["5", "5", "5", "5", "6"], "3 lines had rounded stamps and are spread out"),
+    ],
+)
+def test_the_command_tells_which_stamps_are_no_good(tmp_path: Path, stamps: list[str], told: str) -> None:
+    log = write(tmp_path, *(odom(t, x) for x, t in enumerate(stamps)), flaser("7", [1.0] * 180, 6))
+    command = [sys.executable, "-m", "processing.cli", "import", "carmen", log, "-o", tmp_path / "out.mcap"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, f"rtlog-atlas: {told}\n")
 
 
 def test_l_lines_are_centimetres_and_tell_the_mount(tmp_path: Path) -> None:
