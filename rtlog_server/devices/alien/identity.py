@@ -5,7 +5,7 @@ In: a `Console`, just logged in. Out: a `ReaderIdentity`; what the reader does n
     with contextlib.closing(Console(device)) as console:
         identity = read_identity(console, time.time_ns())
 
-It asks and sets nothing, so it may come before the driver's own settings: the mode that it tells is the one found.
+It asks and sets nothing, so it may come before the driver's own settings.
 """
 
 from dataclasses import dataclass
@@ -24,17 +24,11 @@ class ReaderIdentity:
 
     name: str
     reader_type: str  # with the model and its band
-    reader_number: str  # readers tell no serial number; this one is set by the owner
     mac_address: str  # unique; that of the network interface
     firmware: str
     max_antenna: str  # the highest index of an antenna port
     antenna_sequence: str  # the ports that are read in turn
-    rf_level: str  # in 0.1 dBm
     rf_attenuation: str  # in 0.1 dB below full power
-    auto_mode: str  # ON: reads by itself
-    notify_mode: str
-    tag_stream_mode: str
-    uptime_s: str
     clock: str  # YYYY/MM/DD hh:mm:ss; a reader without a time server starts in 1970
     clock_error_s: float | None  # reader minus host, if its clock is read as UTC; None: it tells no time
 
@@ -45,17 +39,11 @@ def read_identity(console: Console, utc_ns: int) -> ReaderIdentity:
     return ReaderIdentity(
         name=ask_setting(console, "ReaderName"),
         reader_type=ask_setting(console, "ReaderType"),
-        reader_number=ask_setting(console, "ReaderNumber"),
         mac_address=ask_setting(console, "MACAddress"),
         firmware=ask_setting(console, "ReaderVersion"),
         max_antenna=ask_setting(console, "MaxAntenna"),
         antenna_sequence=ask_setting(console, "AntennaSequence"),
-        rf_level=ask_setting(console, "RFLevel"),
         rf_attenuation=ask_setting(console, "RFAttenuation"),
-        auto_mode=ask_setting(console, "AutoMode"),
-        notify_mode=ask_setting(console, "NotifyMode"),
-        tag_stream_mode=ask_setting(console, "TagStreamMode"),
-        uptime_s=ask_setting(console, "Uptime"),
         clock=clock,
         clock_error_s=_clock_error_s(clock, utc_ns),
     )
