@@ -23,7 +23,7 @@ from processing.sweeps import StoredScans, Sweeps
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-GRID_SPACING_M = 0.15  # scans closer to each other than this add nothing to a grid
+GRID_SPACING_M = 0.3  # scans closer to each other than this add nothing to a grid
 
 
 @dataclass(frozen=True, slots=True)
