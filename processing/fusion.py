@@ -5,6 +5,8 @@ In: `Motions` of the odometry, the matches of the scans at the same steps, in th
 
 Source: Lavigne & Marshall 2012, eq. (3), (4): a Kalman update with the odometry a priori. What makes it right is a
 match that admits what it cannot see: along a smooth drift its variance is large, and the wheels decide.
+
+The open loop takes one step at a time, compiled: `chain_step.weigh`. This is the plain form that tests hold it against.
 """
 
 import numpy as np
