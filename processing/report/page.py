@@ -41,9 +41,11 @@ def write_report(atlas: Path, output: Path) -> None:
     """Write the page whole or not at all, over an older one.
 
     Raises:
-        BadInputError: there is no atlas, or a file of it is missing or malformed.
+        BadInputError: there is no atlas, a file of it is missing or malformed, or what is at `output` is no file.
         RTLogError: the page cannot be written.
     """
+    if output.exists() and not output.is_file():
+        raise BadInputError(f"{output} is there and is no file; it is left as it is")
     page = make_page(atlas)
     part = output.with_name(f".{output.name}.part")
     try:

@@ -103,6 +103,11 @@ def test_the_verb_writes_a_page_whole_or_not_at_all(small_atlas: Path, tmp_path:
     result = report(copy, "-o", tmp_path / "torn.html")
     assert (result.returncode, result.stderr.count("\n")) == (2, 1)
     assert f"{copy / 'edges'}" in result.stderr
+    result = report(small_atlas, "-o", tmp_path)
+    assert (result.returncode, result.stderr) == (
+        2,
+        f"rtlog-atlas: {tmp_path} is there and is no file; it is left as it is\n",
+    )
     result = report(small_atlas, "-o", tmp_path / "absent" / "page.html")
     assert result.returncode == 1
     assert f"{tmp_path / 'absent' / 'page.html'}: cannot be written: No such file or directory" in result.stderr
