@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hw_profiles.errors import RTLogError
+from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas import caveats, read_document
 from processing.edge_arrays import read_edge_arrays
 from processing.geometry import Array
