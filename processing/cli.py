@@ -5,6 +5,7 @@ What a verb needs is imported in the verb, so that `--help` does not wait for co
 
 import argparse
 import json
+import os
 import signal
 import sys
 import time
@@ -79,6 +80,7 @@ def _jobs(text: str) -> int:
 
 
 def _build(args: argparse.Namespace) -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads wait for each other; --jobs does not
     from hw_profiles.profile import load_profile
     from processing.atlas import caveats, refuse_existing
     from processing.pipeline import Config, build
