@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--worlds", default=",".join(WORLDS), help="default: %(default)s")
     parser.add_argument("--seeds", type=int, default=3, help="default: %(default)s")
     args = parser.parse_args()
-    command = " ".join(["python", *sys.argv])
+    command = " ".join([".venv/bin/python", *sys.argv])
     print(
         HEADER.format(
             seeds=args.seeds, command=command, machine=f"{platform.machine()}, Python {platform.python_version()}"
