@@ -38,6 +38,7 @@ from processing.open_loop import (
 )
 from processing.pieces import PieceInput, SolvedPiece, cut_span, rename, solve_piece
 from processing.polar_matching import match_polar
+from processing.polar_scan import ranges_at
 from processing.read_log import Run, read_log
 from processing.recordings import group_parts
 from processing.remarks import remarks
@@ -57,7 +58,7 @@ MAX_REVIEWS = 2  # a pass that was not read may only show when another one has b
 def match_polar_scans(reference: Scan, current: Scan, guess: Array) -> ScanMatch:
     """Polar scan matching on scans as the other stages keep them."""
     angles = reference.angle_min + reference.angle_increment * np.arange(len(reference.points), dtype=np.float64)
-    return match_polar(np.hypot(*reference.points.T), np.hypot(*current.points.T), angles, guess)
+    return match_polar(ranges_at(angles, reference.points), ranges_at(angles, current.points), angles, guess)
 
 
 MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans, "psm": match_polar_scans}

@@ -21,6 +21,28 @@ MIN_BEAMS = 3  # fewer in a row are no surface
 NORMAL_BEAMS, NORMAL_M = 5, 0.2  # a normal is that of the line through as much on either side, whichever is more
 
 
+def ranges_at(angles: Array, points: NDArray[np.floating]) -> Array:
+    """Ranges (B,) at even bearings of a sweep whose points (B, 2) the vehicle's motion has moved off them.
+
+    At 4 m/s the last beam's point lies centimetres off its bearing, by the same at every scan: taken for a range at
+    that bearing it turns each match to one side. NaN where a bearing has no points close by on both sides.
+    """
+    valid = np.flatnonzero(np.isfinite(points[:, 0]))
+    if len(valid) < 2:
+        return np.full(len(angles), np.nan)
+    x, y = points[valid].astype(np.float64).T
+    turned = np.arctan2(y, x) - angles[valid]  # small, also where the bearing itself passes ±π
+    bearings = angles[valid] + (turned + np.pi) % (2 * np.pi) - np.pi
+    order = np.argsort(bearings, kind="stable")
+    bearings, ranges, beams = bearings[order], np.hypot(x, y)[order], valid[order]
+    right = np.searchsorted(bearings, angles).clip(1, len(bearings) - 1)
+    left = right - 1
+    share = (angles - bearings[left]) / np.maximum(bearings[right] - bearings[left], 1e-12)
+    between = (share >= 0) & (share <= 1) & (np.abs(beams[right] - beams[left]) <= 2)
+    # a wall is a sine in 1 / range; what comes to lie between two surfaces is of neither, and no surface by itself
+    return np.where(between, 1 / (1 / ranges[left] + share * (1 / ranges[right] - 1 / ranges[left])), np.nan)
+
+
 @njit(cache=True)
 def filter_ranges(ranges: Array) -> Array:
     """Median over the valid beams of each window (B,); a beam that is invalid itself stays so."""

@@ -10,7 +10,7 @@ from hw_profiles.profile import OdometryNoise
 from processing import geometry, odometry
 from processing.import_carmen import parse_lines
 from processing.polar_matching import _project, match_polar
-from processing.polar_scan import filter_ranges, fit_normals, label_surfaces
+from processing.polar_scan import filter_ranges, fit_normals, label_surfaces, ranges_at
 from processing.relations import read_relations, relation_errors
 
 REAL = Path("../shared/data/carmen")
@@ -254,3 +254,21 @@ def test_real_scans_in_a_row_beat_the_odometry() -> None:
     found = relation_errors(stamps, matched, relations, stamps, poses)
     assert found.translation_mean_m < raw.translation_mean_m / 3
     assert found.rotation_mean_deg < raw.rotation_mean_deg / 3
+
+
+def test_a_sweep_made_on_the_way_is_told_at_even_bearings() -> None:
+    """At 4 m/s every beam starts from elsewhere; taken for ranges at their bearings, the points turn every match."""
+    way = np.zeros((len(LMS111), 3))
+    way[:, 0] = 4.0 * 0.02 / 720 * np.arange(len(LMS111))  # 50 Hz: 20 ms a turn
+    ranges = np.array([scan(drift(0.0), pose, LMS111[k : k + 1])[0] for k, pose in enumerate(way)])
+    ranges[np.isinf(ranges)] = np.nan
+    points = ranges[:, None] * np.column_stack([np.cos(LMS111), np.sin(LMS111)]) + way[:, :2]
+    still, found = scan(drift(0.0), STILL), ranges_at(LMS111, points)
+    both = np.isfinite(found) & np.isfinite(still) & (still < 15)
+    assert both.sum() > 0.95 * (still < 15).sum()
+    assert_allclose(found[both], still[both], atol=2e-3)
+    assert np.abs(np.hypot(*points.T) - still)[both].max() > 0.03  # as it would be taken for
+    assert np.isnan(ranges_at(LMS111, np.full((len(LMS111), 2), np.nan))).all()
+    matched = match_polar(found, still, LMS111, STILL)
+    assert abs(matched.motion[2]) < 1e-4
+    assert abs(matched.motion[1]) < 5e-4
