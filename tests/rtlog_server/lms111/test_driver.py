@@ -32,7 +32,7 @@ def test_scans_arrive_as_they_were_measured(dialect: str, open_drive: Open, feed
         assert scan.complete_ns - scan.measured_ns == pytest.approx(15e6, rel=0.03)
     errors_ms = feeder.errors_ms(scans)
     assert errors_ms.min() > -0.1  # never earlier than it was, but for the drift
-    assert np.percentile(errors_ms, 75) < 1.0  # the scheduler of a busy test machine delays some of both ends' steps
+    assert np.percentile(errors_ms, 75) < 4.0  # the scheduler of a busy test machine delays some of both ends' steps
     assert drive.driver.identity == {"model": "LMS111", "firmware": "V1.80.2", "serial_number": "14090017"}
     assert drive.driver.diagnostics["dialect"] == f"CoLa {dialect}"
     assert drive.driver.diagnostics["temperature"] == "ok"
