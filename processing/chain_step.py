@@ -1,7 +1,7 @@
 """One step of the chain of key frames, compiled: what happens for every scan must not wait for small arrays in Python.
 
-The same as `compose`, `compose_jacobians`, `through_mount`, `consistent` and `fuse` do for many steps at once; the
-tests hold the two against each other.
+The same as `compose`, `compose_jacobians` and `through_mount` do for many steps at once; the tests hold the two against
+each other.
 """
 
 import math
@@ -9,8 +9,6 @@ import math
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from processing.fusion import CHI_SQUARED_3_999
 
 Array = NDArray[np.float64]
 
@@ -49,20 +47,3 @@ def to_vehicle(mount: Array, from_laser: Array, motion: Array, covariance: Array
         [[cm, -sm, s * mount[0] + c * mount[1]], [sm, cm, -c * mount[0] + s * mount[1]], [0.0, 0.0, 1.0]]
     )
     return moved, jacobian @ covariance @ jacobian.T
-
-
-@njit(cache=True)
-def weigh(
-    expected: Array, expected_covariance: Array, gate: float, matched: Array, matched_covariance: Array
-) -> tuple[bool, Array, Array]:
-    """Whether a match agrees with the odometry within its gate, and the motion that both give (eq. 3, 4)."""
-    innovation = matched - expected
-    innovation[2] = -((-innovation[2] + math.pi) % (2 * math.pi) - math.pi)
-    spread = gate * expected_covariance + matched_covariance
-    agrees = innovation @ np.linalg.solve(spread, innovation) <= CHI_SQUARED_3_999
-    gain = np.ascontiguousarray(np.linalg.solve(expected_covariance + matched_covariance, expected_covariance).T)
-    fused = expected + gain @ innovation
-    fused[2] = -((-fused[2] + math.pi) % (2 * math.pi) - math.pi)
-    kept = np.eye(3) - gain
-    doubt = kept @ expected_covariance @ kept.T + gain @ matched_covariance @ gain.T
-    return bool(agrees), fused, doubt

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import OdometryNoise
-from processing.chain_step import carry, join, to_laser, to_vehicle, weigh
+from processing.chain_step import carry, join, to_laser, to_vehicle
+from processing.fusion import fuse
 from processing.geometry import accumulate, compose, inverse
 from processing.match_search import search_match
 from processing.odometry import Motions, odom_motions, wheel_motions
@@ -143,7 +144,7 @@ class _Chain:
         if not (result.converged and result.inliers >= MIN_INLIERS):
             return False
         motion, doubt = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
-        agrees, fused, fused_covariance = weigh(driven, covariance, GATE, motion, doubt)
+        agrees, fused, fused_covariance = fuse(driven, covariance, GATE, motion, doubt)
         if not agrees:
             return False
         if search:  # what had to be searched for may be elsewhere

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from processing.chain_step import carry, join, to_laser, to_vehicle, weigh
-from processing.fusion import consistent, fuse
+from processing.chain_step import carry, join, to_laser, to_vehicle
 from processing.geometry import compose, compose_jacobians, inverse, wrap_angle
-from processing.odometry import Motions
 from processing.scan_match import through_mount
 
 
@@ -44,16 +42,3 @@ def test_motions_pass_through_the_mount_both_ways(rng: np.random.Generator) -> N
     back = to_laser(mount, inverse(mount), moved)
     assert_allclose(back[:2], motion[:2], atol=1e-12)
     assert_allclose(wrap_angle(back[2] - motion[2]), 0, atol=1e-12)
-
-
-@pytest.mark.parametrize("off", [0.0, 0.1, 1.0])
-def test_a_match_is_judged_and_fused_as_many_are(rng: np.random.Generator, off: float) -> None:
-    expected, prior, doubt = random_pose(rng), random_covariance(rng), random_covariance(rng)
-    expected[2] = np.pi - 0.01  # the innovation goes over the edge of the circle
-    matched = compose(expected, off * random_pose(rng) + [0, 0, 0.02])
-    odometry, gated = Motions(expected[None], prior[None]), Motions(expected[None], 9.0 * prior[None])
-    fused = fuse(odometry, matched[None], doubt[None], np.array([True]))
-    agrees, motion, covariance = weigh(expected, prior, 9.0, matched, doubt)
-    assert agrees == consistent(gated, matched[None], doubt[None])[0]
-    assert_allclose(motion, fused.deltas[0], atol=1e-12)
-    assert_allclose(covariance, fused.covariances[0], atol=1e-12)
