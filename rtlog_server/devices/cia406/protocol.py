@@ -183,15 +183,18 @@ def describe_device_type(device_type: int) -> str:
 
 
 BUS_OFF_CLASS, NO_ACKNOWLEDGE_CLASS, CONTROLLER_CLASS, RESTARTED_CLASS = 0x40, 0x20, 0x04, 0x100
-CONTROLLER_PASSIVE = 0x30  # of the data's second byte
+CONTROLLER_PASSIVE, CONTROLLER_ACTIVE = 0x30, 0x40  # of the data's second byte
 
 
 def describe_error_frame(classes: int, data: bytes) -> str:
     """What the CAN controller reports of itself (Linux); `classes` are the frame's identifier bits."""
+    state = data[1] if classes & CONTROLLER_CLASS and len(data) > 1 else 0
     if classes & BUS_OFF_CLASS:
         return "bus-off"
-    if classes & CONTROLLER_CLASS and len(data) > 1 and data[1] & CONTROLLER_PASSIVE:
+    if state & CONTROLLER_PASSIVE:
         return "error passive"
+    if state & CONTROLLER_ACTIVE:
+        return "ok"  # its error counters have fallen again
     if classes & NO_ACKNOWLEDGE_CLASS:
         return "no acknowledge"
     return "restarted" if classes & RESTARTED_CLASS else "bus errors"

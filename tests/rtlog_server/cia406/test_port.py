@@ -73,6 +73,9 @@ def test_the_controllers_reports_are_kept_and_bus_off_is_a_failure(port: CanPort
     line.send(error_frame(0x04, b"\x00\x20" + bytes(6)))
     assert port.receive(5.0) is None
     assert port.controller == "error passive"
+    line.send(error_frame(0x04, b"\x00\x40" + bytes(6)))
+    assert port.receive(5.0) is None
+    assert port.controller == "ok"
     line.send(error_frame(0x40))
     with pytest.raises(DeviceError, match=r"virtual:\w+: bus-off: cable, terminators, bit rate"):
         port.receive(5.0)

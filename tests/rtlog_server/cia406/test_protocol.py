@@ -131,6 +131,7 @@ def test_device_types_are_named() -> None:
 def test_error_frames_tell_how_the_controller_is() -> None:
     assert describe_error_frame(0x40, bytes(8)) == "bus-off"
     assert describe_error_frame(0x04, b"\x00\x20" + bytes(6)) == "error passive"
+    assert describe_error_frame(0x04, b"\x00\x40" + bytes(6)) == "ok"  # active again
     assert describe_error_frame(0x20, bytes(8)) == "no acknowledge"
     assert describe_error_frame(0x100, bytes(8)) == "restarted"
 
