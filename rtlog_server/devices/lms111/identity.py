@@ -9,7 +9,7 @@ from typing import Any
 
 from rtlog_server.devices.lms111.connection import Connection, RefusedError, open_connection
 from rtlog_server.devices.lms111.protocol import CONTAMINATION, DEVICE_ERROR, MEASURING, state_name
-from rtlog_server.devices.lms111.sweep import AHEAD_1E4DEG, STATUS
+from rtlog_server.devices.lms111.sweep import STATUS
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +24,7 @@ class ScannerIdentity:
     device_state: int | None  # 0: busy or somebody is logged in, 1: ready, 2: error
     contamination: int | None  # of `protocol.CONTAMINATION`: 0 is a clean window
     device_status: int | None  # of its newest scan, of `sweep.STATUS`: 0 is well
-    scan_frequency_hz: float
-    resolution_deg: float
-    angle_min_deg: float  # the sector that it sends, in the scanner's frame: 0 is ahead, counter-clockwise
-    angle_max_deg: float
     operating_hours: float | None
-    power_ons: int | None
-    clock_us: int | None  # since power-up, modulo 2^32 (71.6 min), at its newest scan
 
     @property
     def problem(self) -> str:
@@ -62,15 +56,12 @@ def ask_identity(connection: Connection) -> ScannerIdentity:
     """Ask on an open connection that streams no scans. Raises: DeviceError."""
     (firmware,) = connection.ask("sRN FirmwareVersion")
     state, outside_temperature = connection.ask("sRN STlms")
-    frequency_centihz, _, resolution, _, _ = connection.ask("sRN LMPscancfg")
-    _, _, start, stop = connection.ask("sRN LMPoutputRange")
     (scan,) = _ask_if_known(connection, "sRN LMDscandata") if state == MEASURING else (None,)
     model, _ = _ask_if_known(connection, "sRN DeviceIdent", 2)
     (location,) = _ask_if_known(connection, "sRN LocationName")
     (device_state,) = _ask_if_known(connection, "sRN SCdevicestate")
     (contamination,) = _ask_if_known(connection, "sRN LCMstate")
     (tenths_of_hours,) = _ask_if_known(connection, "sRN ODoprh")
-    (power_ons,) = _ask_if_known(connection, "sRN ODpwrc")
     return ScannerIdentity(
         dialect=connection.dialect.value,
         model=model.strip() if model is not None else None,
@@ -82,13 +73,7 @@ def ask_identity(connection: Connection) -> ScannerIdentity:
         device_state=device_state,
         contamination=contamination,
         device_status=scan.device_status[1] if scan else None,
-        scan_frequency_hz=frequency_centihz / 100,
-        resolution_deg=resolution / 1e4,
-        angle_min_deg=(start - AHEAD_1E4DEG) / 1e4,
-        angle_max_deg=(stop - AHEAD_1E4DEG) / 1e4,
         operating_hours=tenths_of_hours / 10 if tenths_of_hours is not None else None,
-        power_ons=power_ons,
-        clock_us=scan.time_since_startup_us if scan else None,
     )
 
 
