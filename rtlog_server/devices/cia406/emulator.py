@@ -114,7 +114,8 @@ class CanBusEmulator:
         while not self._unplugged.is_set():
             frames: list[Frame] = []
             while self._wanted:
-                frames += self._wanted.popleft()()
+                frames += self._wanted[0]()
+                self._wanted.popleft()  # now that it is done: `wait_until_done` looks at this
             now_ns = time.monotonic_ns()
             present = [encoder for node, encoder in self.nodes.items() if node not in self._muted]
             for encoder in present:
