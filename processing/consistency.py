@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from processing.edge_arrays import read_edge_arrays
+from processing.evaluation import truth_at
 from processing.geometry import Array, relative, rotation, wrap_angle
 
 DIMENSIONS = 3
@@ -84,14 +85,6 @@ def edge_errors(
         if error is not None:
             found.append(error)
     return found
-
-
-def truth_at(stamps_ns: NDArray[np.int64], poses: Array, wanted_ns: NDArray[np.int64]) -> Array:
-    """Poses (k, 3) at the wanted stamps (k,), linear between those (m, 3) at ascending stamps."""
-    since = (wanted_ns - stamps_ns[0]).astype(float)
-    at = (stamps_ns - stamps_ns[0]).astype(float)
-    columns = [poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])]
-    return np.column_stack([np.interp(since, at, column) for column in columns])
 
 
 def mean_band(count: int) -> tuple[float, float]:

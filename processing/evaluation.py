@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry import Array, align, compose, relative, transform, wrap_angle
+from processing.geometry import Array, align, compose, interpolate_poses, relative, transform, wrap_angle
 
 START_EVERY_M = 1.0  # relative errors start at every metre driven, so that standing still weighs nothing
 ROUNDING_M = 1e-6
@@ -76,18 +76,18 @@ class Distribution:
 
 
 def match_truth(estimate: Trajectory, truth: Trajectory) -> Matched:
-    """The estimate's poses beside the truth at their stamps: linear between its poses, headings the shorter way."""
+    """The estimate's poses beside the truth at their stamps."""
     counted = (estimate.stamps_ns >= truth.stamps_ns[0]) & (estimate.stamps_ns <= truth.stamps_ns[-1])
     stamps = estimate.stamps_ns[counted]
-    right = np.searchsorted(truth.stamps_ns, stamps).clip(1, max(len(truth.stamps_ns) - 1, 1))
-    left, right = right - 1, right.clip(0, len(truth.stamps_ns) - 1)
-    gap_ns = np.maximum(truth.stamps_ns[right] - truth.stamps_ns[left], 1)
-    share = ((stamps - truth.stamps_ns[left]) / gap_ns)[:, None]
-    change = truth.poses[right] - truth.poses[left]
-    change[:, 2] = wrap_angle(change[:, 2])
-    poses = truth.poses[left] + share * change
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    return Matched(estimate.poses[counted], poses, int(np.sum(~counted)))
+    return Matched(estimate.poses[counted], truth_at(truth.stamps_ns, truth.poses, stamps), int(np.sum(~counted)))
+
+
+def truth_at(stamps_ns: NDArray[np.int64], poses: Array, wanted_ns: NDArray[np.int64]) -> Array:
+    """Poses (k, 3) at the wanted stamps (k,): linear between those (m, 3) at ascending stamps."""
+    since, wanted = ((of - stamps_ns[0]).astype(float) for of in (stamps_ns, wanted_ns))
+    found = interpolate_poses(since, poses, wanted)
+    found[:, 2] = wrap_angle(found[:, 2])
+    return found
 
 
 def align_parts(runs: Mapping[str, Matched], parts: Mapping[str, int]) -> dict[int, Array]:

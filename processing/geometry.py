@@ -93,3 +93,11 @@ def align(source: Array, target: Array) -> Array:
     angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     shift = target.mean(axis=0) - rotation(angle) @ source.mean(axis=0)
     return np.array([shift[0], shift[1], angle])
+
+
+def interpolate_poses(times: Array, poses: Array, at: Array) -> Array:
+    """Poses (k, 3) at times `at` (k,), between poses (m, 3) at rising `times` (m,); held before the first and after
+    the last.
+    """
+    columns = [poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])]
+    return np.column_stack([np.interp(at, times, column) for column in columns])

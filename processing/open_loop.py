@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from hw_profiles.profile import OdometryNoise
 from processing.chain_step import carry, join, to_laser, to_vehicle
 from processing.fusion import fuse
-from processing.geometry import accumulate, compose, inverse
+from processing.geometry import accumulate, compose, interpolate_poses, inverse
 from processing.match_search import search_match
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
-from processing.scan_matching import Matcher, match_scans
+from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
-from processing.sweeps import StoredScans, Sweeps, sweeps_of
+from processing.sweeps import StoredScans, Sweeps
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -93,14 +93,6 @@ def odometry_at_scans(run: Run) -> Motions:
         return wheel_motions(run.profile, first, second)
     assert run.odometry is not None
     return odom_motions(interpolate_poses(run.motion_times, run.odometry, times), FOREIGN_NOISE)
-
-
-def interpolate_poses(times: Array, poses: Array, at: Array) -> Array:
-    """Poses (k, 3) at times `at` (k,), between poses (m, 3) at rising `times` (m,); held before the first and after
-    the last.
-    """
-    columns = [poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])]
-    return np.column_stack([np.interp(at, times, column) for column in columns])
 
 
 class _Chain:
@@ -262,13 +254,6 @@ def join_segments(sweeps: Sweeps, odometry: Motions, parts: Sequence[DrivenSegme
         np.concatenate([np.zeros((1, 3)), *offsets]),
         np.concatenate([np.zeros(1, bool), *matched]),
     )
-
-
-def estimate_open_loop(run: Run, forced: Ints, match: Matcher = match_scans) -> OpenLoop:
-    """Drive through a run, segment by segment. `forced`: scans that shall be key frames, ascending."""
-    odometry = odometry_at_scans(run)
-    sweeps = sweeps_of(run.scans, odometry, mount_pose(run))
-    return join_segments(sweeps, odometry, [drive_segment(of, match) for of in cut_segments(sweeps, odometry, forced)])
 
 
 def _in_a_row(motions: list[Array], covariances: list[Array], robust: bool) -> Links:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.edge_placement import Placed
-from processing.geometry import accumulate, compose, relative
+from processing.geometry import accumulate, compose, interpolate_poses, relative
 from processing.odometry import odom_motions, wheel_motions
-from processing.open_loop import FOREIGN_NOISE, OpenLoop, interpolate_poses
+from processing.open_loop import FOREIGN_NOISE, OpenLoop
 from processing.read_log import Run
 
 Array = NDArray[np.float64]

@@ -13,7 +13,8 @@ from table import Figure, report
 
 from processing.atlas import read_document
 from processing.comparison import read_trajectories
-from processing.consistency import consistency, edge_errors, truth_at
+from processing.consistency import consistency, edge_errors
+from processing.evaluation import truth_at
 from processing.geometry import Array
 from processing.open_loop import odometry_at_scans
 from processing.pipeline import Config, build

@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from hw_profiles.errors import BadInputError
-from processing.consistency import consistency, edge_error, edge_errors, mean_band, truth_at
+from processing.consistency import consistency, edge_error, edge_errors, mean_band
+from processing.evaluation import truth_at
 from processing.geometry import accumulate, compose, relative
 
 COVARIANCE = np.array([[0.04, 0.01, 0.001], [0.01, 0.02, 0.0], [0.001, 0.0, 0.0004]])

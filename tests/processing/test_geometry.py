@@ -58,3 +58,12 @@ def test_accumulate_is_repeated_composition(poses: np.ndarray) -> None:
 def test_align_finds_the_transform(poses: np.ndarray) -> None:
     points = np.random.default_rng(2).normal(0, 5, (50, 2))
     same(g.align(points, g.transform(poses[3], points)), poses[3])
+
+
+def test_poses_between_samples_turn_the_short_way() -> None:
+    times, poses = np.array([0.0, 1.0, 2.0]), np.array([[0, 0, 3.0], [2, 4, -3.0], [2, 4, -2.0]], float)
+    between = g.interpolate_poses(times, poses, np.array([-1.0, 0.5, 1.25, 9.0]))
+    turn = 2 * np.pi - 6
+    expected = [[0, 0, 3.0], [1, 2, 3 + turn / 2], [2, 4, -2.75], [2, 4, -2.0]]
+    assert_allclose(between[:, :2], np.array(expected)[:, :2])
+    assert_allclose(g.wrap_angle(between[:, 2] - np.array(expected)[:, 2]), 0, atol=1e-12)

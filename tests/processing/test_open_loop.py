@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 
 from processing.geometry import accumulate, compose, inverse, relative, wrap_angle
 from processing.odometry import Motions, dead_reckon
-from processing.open_loop import estimate_open_loop, interpolate_poses, mount_pose, odometry_at_scans
+from processing.open_loop import OpenLoop, cut_segments, drive_segment, join_segments, mount_pose, odometry_at_scans
 from processing.pipeline import DrivenRun
 from processing.read_log import Run, read_log
 from processing.read_scans import Scans
 from processing.scan_match import ScanMatch
-from processing.scan_matching import match_scans
+from processing.scan_matching import Matcher, match_scans
 from processing.scan_walls import Scan, prepare_scan
 from processing.simulation.simulate import simulate
 from processing.sweeps import StoredScans, sweeps_of
@@ -48,18 +48,15 @@ def without_laser(run: Run, scans: slice) -> Run:
     return replace(run, scans=replace(run.scans, ranges=ranges))
 
 
+def estimate_open_loop(run: Run, forced: np.ndarray, match: Matcher = match_scans) -> OpenLoop:
+    odometry = odometry_at_scans(run)
+    sweeps = sweeps_of(run.scans, odometry, mount_pose(run))
+    return join_segments(sweeps, odometry, [drive_segment(of, match) for of in cut_segments(sweeps, odometry, forced)])
+
+
 def first_scans(run: Run, count: int) -> Run:
     s = run.scans
     return replace(run, scans=replace(s, stamps_ns=s.stamps_ns[:count], times=s.times[:count], ranges=s.ranges[:count]))
-
-
-def test_poses_between_samples_turn_the_short_way() -> None:
-    times, poses = np.array([0.0, 1.0, 2.0]), np.array([[0, 0, 3.0], [2, 4, -3.0], [2, 4, -2.0]], float)
-    between = interpolate_poses(times, poses, np.array([-1.0, 0.5, 1.25, 9.0]))
-    turn = 2 * np.pi - 6
-    expected = [[0, 0, 3.0], [1, 2, 3 + turn / 2], [2, 4, -2.75], [2, 4, -2.0]]
-    assert_allclose(between[:, :2], np.array(expected)[:, :2])
-    assert_allclose(wrap_angle(between[:, 2] - np.array(expected)[:, 2]), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
