@@ -4,7 +4,6 @@ In: the true position of every encoder as a function of time. Out: frames of the
 names: python-can's, or an slcan adapter on a pseudo-terminal. One thread serves all nodes.
 """
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -17,11 +16,10 @@ from rtlog_server.devices.cia406.port import CanPort
 from rtlog_server.devices.cia406.protocol import Emergency, Frame
 from rtlog_server.devices.cia406.slcan_adapter import SlcanAdapter
 from rtlog_server.devices.device import DeviceError
+from rtlog_server.devices.emulated_bus import WATCH_S, EmulatedBus
 
-WATCH_S = 0.02  # how often the thread looks whether it is to stop, or to do what a test wants
 
-
-class CanBusEmulator:
+class CanBusEmulator(EmulatedBus):
     """Encoders on a bus, running from construction to `close()`; a context manager.
 
     Args:
@@ -35,32 +33,17 @@ class CanBusEmulator:
     """
 
     def __init__(self, bus: CanBus, encoders: Mapping[int, int], position: Callable[[int, int], int]) -> None:
+        super().__init__(f"CAN emulator {bus.place}")
         self.bus = bus
         self.nodes = {
             node: EmulatedEncoder(node, counts_per_turn, lambda now_ns, node=node: position(node, now_ns))  # type: ignore[misc]
             for node, counts_per_turn in encoders.items()
         }
-        self._muted: set[int] = set()
         self._wanted: deque[Callable[[], list[Frame]]] = deque()  # what other threads want done in ours
-        self._unplugged = threading.Event()
-        self._thread: threading.Thread | None = None
         self._port: CanPort | SlcanAdapter
         self.replug()
 
-    def __enter__(self) -> "CanBusEmulator":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self.unplug()
-
-    # Faults
-
-    def mute(self, node: int, muted: bool = True) -> None:
-        """The encoder is cut off from the bus, or back; it keeps its power."""
-        (self._muted.add if muted else self._muted.discard)(node)
+    # Faults, beside those of every bus
 
     def power_cycle(self, node: int) -> None:
         """The encoder loses its power for a moment: it boots, all configuration is lost."""
@@ -89,26 +72,17 @@ class CanBusEmulator:
         """Any frame, as of another device on the bus."""
         self._wanted.append(lambda: [frame])
 
-    def unplug(self) -> None:
-        """The bus is cut from the host; of slcan, the adapter is pulled."""
-        if self._thread is None:
-            return
-        self._unplugged.set()
-        self._thread.join()
-        self._thread = None
-        self._port.close()
+    # The thread
 
-    def replug(self) -> None:
-        """The encoders get their power, with the bus."""
+    def _plug(self) -> None:
+        """The encoders get their power with the bus."""
         slcan = self.bus.interface == "slcan"
         self._port = SlcanAdapter(Path(self.bus.channel)) if slcan else CanPort(self.bus)
         for node in self.nodes:
             self.power_cycle(node)
-        self._unplugged.clear()
-        self._thread = threading.Thread(target=self._serve, name=f"CAN emulator {self.bus.place}", daemon=True)
-        self._thread.start()
 
-    # The thread
+    def _pull(self) -> None:
+        self._port.close()
 
     def _serve(self) -> None:
         while not self._unplugged.is_set():

@@ -13,20 +13,19 @@ after power-up, and a host that sends at another rate, or something that it does
 import os
 import select
 import termios
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from rtlog_server.devices.emulated_bus import WATCH_S, EmulatedBus
 from rtlog_server.devices.pty_link import PtyLink
 from rtlog_server.devices.sei import protocol
 
 BAUD_OF = {termios.B9600: 9600, termios.B115200: 115200}
 FIRST_SERIAL_NUMBER = 61000  # of the emulated encoder at address 0
-WATCH_S = 0.02  # how often the thread looks whether it is to stop
 
 
-class SeiBusEmulator:
+class SeiBusEmulator(EmulatedBus):
     """Encoders on a pseudo-terminal, running from construction to `close()`; a context manager.
 
     Args:
@@ -50,34 +49,19 @@ class SeiBusEmulator:
         multi_turn: bool = False,
         strobe: bool = False,
     ) -> None:
+        super().__init__("SEI emulator")
         self._encoders = dict(encoders)
         self._position = position
         self._echo = echo
         self._multi_turn = multi_turn
         self._strobed_ns: int | None = 0 if strobe else None
         self._baud = dict.fromkeys(self._encoders, protocol.POWER_UP_BAUD)
-        self._muted: set[int] = set()
         self._garbled_replies = 0
         self._wrong_replies = 0
         self._pty = PtyLink(link)
-        self._thread: threading.Thread | None = None
-        self._unplugged = threading.Event()
         self.replug()
 
-    def __enter__(self) -> "SeiBusEmulator":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self.unplug()
-
-    # Faults
-
-    def mute(self, address: int, muted: bool = True) -> None:
-        """The encoder is cut off from the bus, or back."""
-        (self._muted.add if muted else self._muted.discard)(address)
+    # Faults, beside those of every bus
 
     def power_cycle(self, address: int) -> None:
         """The encoder loses its power for a moment: back at 9600 baud."""
@@ -95,23 +79,13 @@ class SeiBusEmulator:
         """Noise on the bus."""
         self._pty.write(data)
 
-    def unplug(self) -> None:
-        """The USB adapter is pulled: the terminal hangs up, its name is gone."""
-        if self._thread is None:
-            return
-        self._unplugged.set()
-        self._thread.join()
-        self._thread = None
-        self._pty.unplug()
-
-    def replug(self) -> None:
-        """The adapter is back under the same link."""
-        self._pty.plug()
-        self._unplugged.clear()
-        self._thread = threading.Thread(target=self._serve, name="SEI emulator", daemon=True)
-        self._thread.start()
-
     # The thread
+
+    def _plug(self) -> None:
+        self._pty.plug()
+
+    def _pull(self) -> None:
+        self._pty.unplug()
 
     def _serve(self) -> None:
         received = bytearray()
