@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from msgspec.structs import replace
 
@@ -30,9 +30,6 @@ from rtlog_server.devices.sei.emulator import SeiBusEmulator
 from rtlog_server.realtime import become_realtime
 
 log = logging.getLogger(__name__)
-
-if TYPE_CHECKING:
-    from rtlog_server.devices.cia406.emulator import CanBusEmulator
 
 LOOPBACK = "127.0.0.1"
 Angle = Callable[[str, int], float]  # encoder, monotonic ns → rad
@@ -148,7 +145,7 @@ class Stage:
         emulator: SeiBusEmulator | CanBusEmulator
         if isinstance(there, SeiBus):
             echo, multi_turn = there.echo == "yes", there.turns == "multi"
-            emulator = SeiBusEmulator(Path(there.port), counts, position, echo, multi_turn)
+            emulator = SeiBusEmulator(Path(there.port), counts, position, echo, multi_turn, there.strobe)
         else:
             emulator = CanBusEmulator(there, counts, position)
         self._stack.enter_context(emulator)
