@@ -75,50 +75,45 @@ def compare_recordings(went_in: Path, came_out: Path, report: ReplayReport | Non
     missing = int((~ticks.recorded).sum())
     overruns = int((ticks.lateness_s * 1e9 >= ticks.period_ns).sum())
     figures = came_out, int(ticks.recorded.sum()), missing, overruns
-    if report is not None and report.capture_of is not None:
-        return Comparison(*figures, [_compare_capture(went_in, came_out, profile, report, ticks)])
-    whole = read_span(went_in, 0.0, None)
     if report is None:
+        whole = read_span(went_in, 0.0, None)
         report = ReplayReport(0, whole.start_ns, whole.end_ns, 0, 0, 0)
-    span = Span(report.start_ns, report.end_ns, whole.first_tick_ns)
     causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
-    return Comparison(*figures, _compare_devices((went_in, span), came_out, profile, report, ticks, causes))
+    compare = _compare_devices if report.capture_of is None else _compare_capture
+    return Comparison(*figures, compare(went_in, came_out, profile, report, ticks, causes))
 
 
 def _compare_capture(
-    went_in: Path, came_out: Path, profile: Profile, report: ReplayReport, ticks: TicksOut
-) -> DeviceComparison:
-    device = report.capture_of or ""
+    went_in: Path, came_out: Path, profile: Profile, report: ReplayReport, ticks: TicksOut, causes: Causes
+) -> list[DeviceComparison]:
+    device, lasers = report.capture_of, addressed_lasers(profile)
+    if device not in lasers:
+        raise BadInputError(f"{came_out}: its vehicle has no scanner {device}, whose captured bytes were sent")
     if report.rate != 1.0:
         raise BadInputError(f"{went_in}: sent at another rate than its device's clock tells: there is no time to go by")
-    causes = Causes([*fault_causes(report), *stall_causes(report, ticks)], ticks)
     capture = read_capture(went_in)
     events, delay_ns = capture_events(capture, device), transmission_delay_ns(capture)
-    turn_s = 1 / addressed_lasers(profile)[device].scan_frequency_hz
-    return compare_scans(device, events, came_out, report, ticks, causes, turn_s, delay_ns)
+    turn_s = 1 / lasers[device].scan_frequency_hz
+    return [compare_scans(device, events, came_out, report, ticks, causes, turn_s, delay_ns)]
 
 
 def _compare_devices(
-    went_in: tuple[Path, Span],
-    came_out: Path,
-    profile: Profile,
-    report: ReplayReport,
-    ticks: TicksOut,
-    causes: Causes,
+    went_in: Path, came_out: Path, profile: Profile, report: ReplayReport, ticks: TicksOut, causes: Causes
 ) -> list[DeviceComparison]:
     """Of each device that the profile has and the input tells of."""
-    there = read_info(went_in[0]).message_counts
+    there = read_info(went_in).message_counts
+    span = Span(report.start_ns, report.end_ns, read_span(went_in, 0.0, None).first_tick_ns)
     devices = []
     for name, laser in addressed_lasers(profile).items():
         if any(there.get(topic) for topic in TOPICS[name]):
             turn_s = 1 / laser.scan_frequency_hz
-            events = read_events(went_in[0], [name], went_in[1])
+            events = read_events(went_in, [name], span)
             devices.append(compare_scans(name, events, came_out, report, ticks, causes, turn_s))
     if profile.encoders and (there.get(JOINT_STATES.name) or there.get(ODOMETRY.name)):
-        track = read_encoder_track(went_in[0], profile)
+        track = read_encoder_track(went_in, profile)
         devices.append(compare_encoders(track, profile.encoders, came_out, report, ticks, causes))
     if profile.rfid is not None and there.get(TAGS.name):
-        devices.append(compare_tags(went_in, came_out, report, ticks, causes))
+        devices.append(compare_tags((went_in, span), came_out, report, ticks, causes))
     return devices
 
 

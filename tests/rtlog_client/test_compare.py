@@ -1,6 +1,7 @@
 """Every way in which what comes out can differ from what went in is told with its cause."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -160,3 +161,6 @@ def test_what_is_no_recording_of_ours_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "tickless.mcap", {key: row for key, row in rows().items() if key[0] != TICK.name}, 0)
     with pytest.raises(BadInputError, match=r"tickless\.mcap: 0 /rtlog/tick in it"):
         compare_recordings(tmp_path / "in.mcap", tmp_path / "tickless.mcap")
+    bytes_of_another = replace(report(), capture_of="laser/auxiliary")
+    with pytest.raises(BadInputError, match=r"in\.mcap: its vehicle has no scanner laser/auxiliary"):
+        compare_recordings(tmp_path / "captured.bin", tmp_path / "in.mcap", bytes_of_another)
