@@ -13,8 +13,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from hw_profiles.profile import Encoder
 from rtlog_client.difference import Causes, DeviceComparison, Difference, hole_causes
 from rtlog_client.encoder_track import EncoderTrack
@@ -99,9 +97,8 @@ class _Wheel:
         if self._turns_off is None:
             self._turns_off = off
         error = angle_rad - math.tau * off
-        outside = max(min(around) - slack - error, error - max(around) - slack, 0.0)
         self._worst_rad = max(self._worst_rad, abs(error - around[2]))
-        if outside > 0:
+        if not min(around) - slack <= error <= max(around) + slack:
             self.detail = f"{error - around[2]:+.4f} rad off the track"
             return "changed"
         turned, self._turns_off = off - self._turns_off, off
@@ -121,5 +118,5 @@ class _Wheel:
         return {
             "turned_in_rad": round(went_in, 4),
             "turned_out_rad": round(last - first, 4),
-            "worst_error_rad": round(float(np.float64(self._worst_rad)), 5),
+            "worst_error_rad": round(self._worst_rad, 5),
         }

@@ -4,7 +4,6 @@ In: what each device's comparison found. Out: `Difference`s, each with its cause
 link, a gap of the input, a machine that stood still, or none. The law: a difference without a cause is a failure.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -57,10 +56,6 @@ class DeviceComparison:
     superseded: int = 0  # a newer one came in the same tick
     differences: list[Difference] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)
-
-    def count(self, what: str) -> Counter[str]:
-        """How often, by cause."""
-        return Counter(difference.cause for difference in self.differences if difference.what == what)
 
     @property
     def unexplained(self) -> list[Difference]:
