@@ -5,7 +5,7 @@
 
 In: commands, and the bytes of a socket. Out: the values of replies; events with the time of their reception. The law:
 an error reply (sFA) does not say which command it answers, so after a command that was not answered the connection is
-of no use any more and is closed. Every failure is a `DeviceError` that says where.
+of no use any more and is closed, but by one who only asks. Every failure is a `DeviceError` that says where.
 """
 
 import socket

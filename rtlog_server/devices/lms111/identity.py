@@ -1,13 +1,14 @@
 """Which scanner is this, and how is it? What a person wants to know before a drive.
 
 In: an open connection, or the address of a scanner. Out: `ScannerIdentity`. The law: it only asks; nothing in the
-device is changed, nobody logs in. A question that the firmware does not know stays open (None), as old ones know few.
+device is changed, nobody logs in. A question that the firmware refuses, ignores or answers in a way of its own stays
+open (None), as old ones know few.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
-from rtlog_server.devices.lms111.connection import Connection, RefusedError, open_connection
+from rtlog_server.devices.lms111.connection import Connection, NoAnswerError, RefusedError, open_connection
 from rtlog_server.devices.lms111.protocol import CONTAMINATION, DEVICE_ERROR, MEASURING, state_name
 from rtlog_server.devices.lms111.sweep import STATUS
 
@@ -82,4 +83,7 @@ def _ask_if_known(connection: Connection, command: str, values: int = 1) -> tupl
     try:
         return connection.ask(command)
     except RefusedError:
+        return (None,) * values
+    except NoAnswerError:
+        connection.ask("sRN STlms")  # every scanner answers that: one that is gone is not taken for an old one
         return (None,) * values

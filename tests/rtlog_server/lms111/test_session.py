@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from hw_profiles.profile import LaserDevice
-from rtlog_server.devices.device import TickGrid
+from rtlog_server.devices.device import DeviceError, TickGrid
 from rtlog_server.devices.laser import Scan
 from rtlog_server.devices.lms111.cola import Dialect, Receiver, frame
 from rtlog_server.devices.lms111.driver import Lms111
+from rtlog_server.devices.lms111.identity import identify
 from rtlog_server.devices.lms111.protocol import Command, decode, encode_command, reply_name
 from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
 
@@ -293,3 +294,27 @@ def test_a_command_that_is_not_answered_is_named(open_peer: OpenPeer) -> None:
 def test_a_cut_reply_is_a_device_error(open_peer: OpenPeer) -> None:
     _, driver = open_peer(telegrams(REPLIES) | {"sRN LMPscancfg": frame(Dialect.B, b"sRA LMPscancfg \x00\x00")})
     wait_until(lambda: "telegram ends early" in driver.message)
+
+
+IDLE = {"sRN STlms": (3, 0, "00:34:19", "01.01.1970", 0, 0, 0)}
+
+
+def test_a_question_that_a_firmware_ignores_or_answers_in_its_own_way_stays_open() -> None:
+    known = {"sRN LocationName": ("level 2",), "sRN ODoprh": (1110,)}
+    own_way = {"sRN DeviceIdent": frame(Dialect.B, b"sRA DeviceIdent LMS")}
+    with closing(Peer(telegrams(REPLIES | IDLE | known) | own_way)) as peer:
+        identity = identify("127.0.0.1", peer.port)
+    assert (identity.model, identity.contamination) == (None, None)
+    assert (identity.location, identity.operating_hours) == ("level 2", 111.0)
+
+
+class Once(dict[str, bytes]):
+    """Each is given once."""
+
+    get = dict.pop
+
+
+def test_a_scanner_that_falls_silent_while_it_is_asked_is_gone() -> None:
+    replies = Once(telegrams(REPLIES | IDLE))
+    with closing(Peer(replies)) as peer, pytest.raises(DeviceError, match="no answer to sRN STlms"):
+        identify("127.0.0.1", peer.port)
