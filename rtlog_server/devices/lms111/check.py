@@ -14,7 +14,7 @@ def check_scanner(settings: LaserDevice) -> list[Finding]:
         Finding("identity", _describe(identity)),
         _window(identity),
     ]
-    if identity.problem and not identity.contamination:
+    if identity.problem:
         problem, _, advice = identity.problem.partition(": ")
         findings.append(Finding("state", problem, False, advice or "wait for its motor and heater, then check again"))
     return findings

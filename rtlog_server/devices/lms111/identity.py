@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtlog_server.devices.lms111.connection import Connection, NoAnswerError, RefusedError, open_connection
-from rtlog_server.devices.lms111.protocol import CONTAMINATION, DEVICE_ERROR, MEASURING, state_name
+from rtlog_server.devices.lms111.protocol import DEVICE_ERROR, MEASURING, state_name
 from rtlog_server.devices.lms111.sweep import STATUS
 
 
@@ -29,12 +29,10 @@ class ScannerIdentity:
 
     @property
     def problem(self) -> str:
-        """What keeps it from measuring well, in one line; empty: nothing."""
+        """What keeps it from measuring well, in one line; empty: nothing, but for a dirt that `contamination` tells."""
         if self.device_state == DEVICE_ERROR or self.device_status == 1:
             return "the device reports an error: switch it off and on; if it stays, it needs service"
-        if self.contamination:
-            return f"{CONTAMINATION.get(self.contamination, 'front window is dirty')}: clean it"
-        if self.device_status:
+        if self.device_status and not self.contamination:
             return f"{STATUS.get(self.device_status, f'device status {self.device_status}')}: clean the window"
         if self.outside_temperature:
             return "outside of its temperature range: wait for the heater, or cool it"

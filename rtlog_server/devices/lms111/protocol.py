@@ -115,8 +115,8 @@ ERRORS = {  # of sFA
     39: "write mode not enabled",
 }
 
-DEVICE_BUSY, DEVICE_READY, DEVICE_ERROR = 0, 1, 2  # SCdevicestate; busy also while somebody is logged in
-CONTAMINATION = {0: "", 1: "front window is dirty", 2: "front window is too dirty", 3: "front window is very dirty"}
+DEVICE_ERROR = 2  # of SCdevicestate
+CONTAMINATION = {1: "front window is dirty", 2: "front window is too dirty", 3: "front window is very dirty"}
 
 REPLY_VERBS = {"sRN": "sRA", "sWN": "sWA", "sMN": "sAN", "sEN": "sEA"}
 

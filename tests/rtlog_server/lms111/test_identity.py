@@ -51,20 +51,28 @@ def test_a_scanner_that_is_still_starting_has_no_serial_number_yet() -> None:
     assert identity.problem == "is initialising, does not measure yet"
 
 
-@pytest.mark.parametrize(
-    ("status", "problem"),
-    [
-        (1, "the device reports an error"),
-        (2, "front window is dirty: clean it"),
-        (4, "front window is too dirty: clean it"),
-    ],
-)
-def test_what_is_wrong_is_told(status: int, problem: str) -> None:
+def test_an_error_of_the_device_is_told() -> None:
+    with Lms111Emulator() as emulator:
+        emulator.set_status(1)
+        assert "the device reports an error" in identify(*emulator.address).problem
+        measure(emulator)
+        assert "the device reports an error" in identify(*emulator.address).problem
+
+
+@pytest.mark.parametrize(("status", "problem"), [(2, "front window is dirty"), (4, "front window is too dirty")])
+def test_a_dirty_window_is_told_also_by_a_firmware_that_knows_it_from_its_scans_alone(
+    status: int, problem: str
+) -> None:
     with Lms111Emulator() as emulator:
         emulator.set_status(status)
-        assert problem in identify(*emulator.address).problem
         measure(emulator)
-        assert problem in identify(*emulator.address).problem
+        identity = identify(*emulator.address)
+        assert identity.contamination == status // 2
+        assert identity.problem == ""
+        emulator.set_error("sRN LCMstate", 3)
+        identity = identify(*emulator.address)
+        assert identity.contamination is None
+        assert identity.problem == f"{problem}: clean the window"
 
 
 def test_outside_of_its_temperature_range() -> None:
