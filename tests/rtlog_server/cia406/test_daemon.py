@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from hw_profiles.profile import CanBus, parse_profile, shipped_profiles
+from hw_profiles.profile import CanBus, shipped_profiles
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.messages import OK, STALE, decode, to_ns
 from rtlog_server.topics import JOINT_STATES, TICK
@@ -54,12 +54,6 @@ def counts(node: int, at_ns: int) -> int:
     return FIRST_COUNTS + round(TURNS_PER_S[node] * COUNTS * (at_ns - START_NS) * 1e-9)
 
 
-def find_free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
-
-
 class Listener:
     """What the server publishes, by topic."""
 
@@ -81,9 +75,8 @@ class Listener:
 
 
 @pytest.fixture
-def emulator() -> Iterator[CanBusEmulator]:
-    bus = CanBus(interface="udp_multicast", channel="239.74.163.2", udp_port=find_free_udp_port())
-    with CanBusEmulator(bus, dict.fromkeys(TURNS_PER_S, COUNTS), counts) as emulator:
+def emulator(udp: CanBus) -> Iterator[CanBusEmulator]:
+    with CanBusEmulator(udp, dict.fromkeys(TURNS_PER_S, COUNTS), counts) as emulator:
         yield emulator
 
 
@@ -155,8 +148,3 @@ sys.exit(any(name in sys.modules for name in ("can", "canopen")))
 
 def test_both_vehicles_are_shipped_with_their_encoders_on_can() -> None:
     assert {"canmet_trailer_can", "cu_ss534_can"} <= set(shipped_profiles())
-
-
-def test_the_profile_of_this_test_is_right() -> None:
-    text = PROFILE.format(laser_port=1, can_port=2, zenoh_port=3)
-    assert isinstance(parse_profile(text, "canbed").encoder_bus, CanBus)
