@@ -20,6 +20,8 @@ import zenoh
 
 from rtlog_server.attachment import Attachment, unpack_attachment
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
+from rtlog_server.devices.device import Device, TickGrid
+from rtlog_server.devices.encoders import EncoderReading
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 
@@ -199,6 +201,51 @@ class Drive:
         self._thread.join()
         for emulator in (self.laser, self.encoders, self.rfid):
             emulator.close()
+
+
+class EncoderHost:
+    """A running driver of encoders, collected at each tick."""
+
+    def __init__(self, device: Device[EncoderReading], period_ns: int) -> None:
+        self.grid = TickGrid(time.monotonic_ns(), period_ns)
+        self.device = device
+        self.device.start(self.grid)
+        self.readings: list[EncoderReading] = []
+        self.ages_s: list[float] = []
+
+    def wait_for(self, condition: Callable[[], bool], timeout_s: float = 8.0) -> None:
+        """Collect at each tick until the condition holds."""
+        deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        while not condition():
+            tick_ns = self.grid.next_after(time.monotonic_ns())
+            assert tick_ns < deadline_ns, f"{self.device.message}; {self.device.diagnostics}"
+            time.sleep(max(0, tick_ns - time.monotonic_ns()) * 1e-9)
+            collected = self.device.collect(tick_ns)
+            self.readings += collected.samples
+            self.ages_s += [(tick_ns - sample.measured_ns) * 1e-9 for sample in collected.samples]
+
+    def wait_for_readings(self, number: int) -> list[EncoderReading]:
+        """The next so many."""
+        first = len(self.readings)
+        self.wait_for(lambda: len(self.readings) >= first + number)
+        return self.readings[first:]
+
+    def wait_for_message(self, part: str) -> None:
+        self.wait_for(lambda: part in self.device.message)
+
+
+@pytest.fixture
+def start_encoders() -> Iterator[Callable[[Device[EncoderReading], int], EncoderHost]]:
+    """Starts drivers, with the period of their ticks in ns, and closes them at the end."""
+    hosts: list[EncoderHost] = []
+
+    def start(device: Device[EncoderReading], period_ns: int) -> EncoderHost:
+        hosts.append(EncoderHost(device, period_ns))
+        return hosts[-1]
+
+    yield start
+    for host in hosts:
+        host.device.close()
 
 
 @pytest.fixture(scope="module")
