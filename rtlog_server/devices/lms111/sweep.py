@@ -118,7 +118,7 @@ def _remission(scan: ScanData, content: str, rays: int) -> NDArray[np.float32]:
 
 def to_scan(scan: ScanData, transmitted_ns: int, period_us: float, echo: str = "first") -> Scan:
     """A sweep in SI units, the scanner's frame and host time, to which `transmitted_ns` (monotonic) takes its time of
-    transmission; `period_us` is one turn of the head, `echo` "first" or "last". It is complete when it is transmitted.
+    transmission; `period_us` is one turn of the head, `echo` "first" or "last". No ray is later than the transmission.
 
     Raises:
         ColaError: the scan holds no distances, or is one that no scanner can make.
