@@ -52,7 +52,7 @@ class Console:
             pass
         return protocol.clean_reply(piece)
 
-    def send(self, text: str = "") -> None:
+    def send(self, text: str) -> None:
         """Send a command; its reply comes out of `receive`."""
         self.link.send(protocol.command(text))
 

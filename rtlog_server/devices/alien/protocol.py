@@ -69,7 +69,7 @@ def console_splitter() -> Splitter:
 
 
 def line_splitter() -> Splitter:
-    """For tag streams, notifications and the reader's end of the console: lines, some of them empty."""
+    """For tag streams and notifications: lines, some of them empty."""
     return Splitter(b"\r\n\0", MAX_LINE_BYTES)
 
 
@@ -101,8 +101,8 @@ def login_answer(text: str) -> bytes:
     return text.encode("ascii") + b"\r\n"
 
 
-def command(text: str = "") -> bytes:
-    """A command without echo and prompt; the empty one shows that the reader is alive."""
+def command(text: str) -> bytes:
+    """A command without echo and prompt."""
     return b"\x01" + text.encode("ascii") + b"\r\n"
 
 

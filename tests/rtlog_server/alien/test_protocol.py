@@ -143,7 +143,6 @@ def test_the_login_dialogue(text: str, prompt: Prompt | None) -> None:
 
 def test_commands_ask_for_no_echo() -> None:
     assert protocol.command("get ReaderName") == b"\x01get ReaderName\r\n"
-    assert protocol.command() == b"\x01\r\n"
     assert protocol.login_answer("alien") == b"alien\r\n"
     for text in ("a\r\nset AutoMode = OFF", "\0", "ä"):
         with pytest.raises(AlienError, match="printable"):
