@@ -13,7 +13,6 @@ again and again is given up until the reader connects anew. What both tell of a 
 import selectors
 import socket
 import time
-from collections import Counter
 
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices.alien import protocol
@@ -51,8 +50,7 @@ class Alr9650(Device[TagSample]):
         self._awaiting_reply = False
         self._last_list: list[str] = []
         self._overtaken = 0  # lists in succession that told of reads, and the push did not
-        self._tally: Counter[str] = Counter()
-        self._last_garbled = "none"
+        self._garbled, self._last_garbled = 0, "none"
 
     def connect(self) -> None:
         self._console = console = Console(self._settings)
@@ -143,7 +141,7 @@ class Alr9650(Device[TagSample]):
             try:
                 tag = parse_tag(line)
             except AlienError as error:
-                self._tally["garbled"] += 1
+                self._garbled += 1
                 self._last_garbled = str(error)
                 continue
             sample = None if tag is None else self._memory.take(tag, receive_ns)
@@ -167,6 +165,6 @@ class Alr9650(Device[TagSample]):
             "refused settings": ", ".join(setup.refused) or "none",
             "clock": clock if clock == "right" else f"{clock}; stamps are the host's",
             **{event: str((listener.tally if listener else {}).get(event, 0)) for event in COUNTED},
-            "garbled": str(self._tally["garbled"]),
+            "garbled": str(self._garbled),
             "last garbled": (listener.last_garbled if listener else "") or self._last_garbled,
         }
