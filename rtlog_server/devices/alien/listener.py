@@ -71,7 +71,7 @@ class PushListener:
     def _accept(self) -> None:
         try:
             connection, (peer, *_) = self._listener.accept()
-        except OSError:
+        except (BlockingIOError, ConnectionError):
             return  # gone again
         if self._reader_host not in ("", peer):
             self.tally["strangers refused"] += 1
