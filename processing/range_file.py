@@ -29,16 +29,21 @@ class Ranges:
         return self.shape[0]
 
     def __getitem__(self, which: int | slice | Ints) -> Rows:
-        """Rows (k, B), or one (B,). Rows that follow each other are read in one go."""
+        """Rows (k, B), or one (B,). Rows that follow each other are read in one go.
+
+        Raises: RTLogError: the file is shorter than it was.
+        """
         rows = np.arange(len(self))[which]
         wanted = np.atleast_1d(rows)
         breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
         found = np.empty((len(wanted), self.shape[1]), np.float32)
-        with self.path.open("rb", buffering=0) as file:
+        with self.path.open("rb") as file:
             for start, end in zip([0, *breaks], [*breaks, len(wanted)], strict=True):
                 if start < end:
                     file.seek((self.first + int(wanted[start])) * found.itemsize * self.shape[1])
-                    file.readinto(found[start:end].data)
+                    part = found[start:end]
+                    if file.readinto(part.data) != part.nbytes:
+                        raise RTLogError(f"{self.path}: was cut short while it was in use")
         found = found[:, ::-1] if self.is_mirrored else found
         return found if np.ndim(rows) else found[0]
 
@@ -48,24 +53,21 @@ class Ranges:
 
 
 class RangeFile:
-    """Writes the file. Scans shorter than the longest are padded with NaN.
-
-    Raises: RTLogError: the disk is full.
-    """
+    """Writes the file. Scans shorter than the longest are padded with NaN."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows, self.beams = path, 0, 0
         self._file = path.open("w+b")
 
     def append(self, ranges: Rows) -> None:
-        """Append a scan (b,)."""
+        """Append a scan (b,). Raises: RTLogError: the disk is full."""
         if not self.rows:
             self.beams = len(ranges)
-        if len(ranges) > self.beams:
-            self._widen(len(ranges))
-        elif len(ranges) < self.beams:
-            ranges = np.concatenate([ranges, np.full(self.beams - len(ranges), np.nan, np.float32)])
         try:
+            if len(ranges) > self.beams:
+                self._widen(len(ranges))
+            elif len(ranges) < self.beams:
+                ranges = np.concatenate([ranges, np.full(self.beams - len(ranges), np.nan, np.float32)])
             self._file.write(ranges.astype(np.float32, copy=False).tobytes())
         except OSError as error:
             raise self._no_room(error) from error
@@ -81,7 +83,7 @@ class RangeFile:
         self.beams = beams
 
     def finish(self, is_mirrored: bool) -> Ranges:
-        """What was written, ready to be read."""
+        """What was written, ready to be read. Raises: RTLogError: the disk is full."""
         try:
             self._file.flush()
         except OSError as error:
@@ -92,4 +94,8 @@ class RangeFile:
         return RTLogError(f"{self.path}: the scans cannot be kept here: {error.strerror or error}; set TMPDIR")
 
     def close(self) -> None:
-        self._file.close()
+        """Raises: RTLogError: the disk is full, and what is left cannot be written either."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._no_room(error) from error

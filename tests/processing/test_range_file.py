@@ -50,8 +50,19 @@ def test_a_cut_of_it_is_small_and_finds_its_rows(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_told() -> None:
     file = RangeFile(Path("/dev/full"))
-    file.append(ROWS[0])
+    file.append(ROWS[0, :20])
+    with pytest.raises(RTLogError, match="TMPDIR"):
+        file.append(ROWS[1])  # longer, so what is there is written anew
     with pytest.raises(RTLogError, match="TMPDIR"):
         file.finish(is_mirrored=False)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(RTLogError, match="TMPDIR"):
         file.close()
+
+
+def test_a_file_that_was_cut_short_gives_no_made_up_rows(tmp_path: Path) -> None:
+    ranges = write(tmp_path / "a", [30] * 12)
+    with (tmp_path / "a").open("r+b") as file:
+        file.truncate(4 * 30 * 11 + 7)
+    assert_array_equal(ranges[:11], ROWS[:11])
+    with pytest.raises(RTLogError, match="cut short"):
+        ranges[10:]
