@@ -113,9 +113,14 @@ def condense_all(solved: list[SolvedPiece], boundary: Boundary, work: Workers) -
 
 def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     """Links between passes of one tag in parts of the map that no run joins: all else is joined without guessing."""
-    scans: dict[int, Scan] = {}
+    seen_in: dict[int, tuple[SolvedPiece, int]] = {}
     for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
-        scans |= {v: piece.scan(i) for v, i in zip(variables, indices, strict=True)}
+        seen_in |= {v: (piece, i) for v, i in zip(variables, indices, strict=True)}
+
+    def scan(variable: int) -> Scan:
+        piece, index = seen_in[variable]
+        return piece.scan(index)
+
     edges = [(variables[0], v) for variables in boundary.variables for v in variables]
     shape = (boundary.count, boundary.count)
     part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
@@ -124,7 +129,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
         linked: list[int] = []
         for v in sorted(v for v, of in boundary.nodes.items() if of == node):
             for u in [u for u in linked if part[u] != part[v]][:3]:
-                found = register_passes(scans[u], scans[v], solved[0].input.mount)
+                found = register_passes(scan(u), scan(v), solved[0].input.mount)
                 if found is not None:
                     ends.append((u, v))
                     motions.append(found.motion)
