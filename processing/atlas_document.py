@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from processing.atlas import SCHEMA, Atlas
-from processing.edge_files import strong_links
 from processing.edge_placement import Placed, Placement
 from processing.graph import Graph
 from processing.trajectory import keyframe_poses, run_trajectory
@@ -81,7 +80,7 @@ def _edge(piece: Placed, runs: list["DrivenRun"], placement: Placement) -> dict[
     of = piece.solved.input.piece
     kind = "edge" if of.j is not None else "spur" if of.i is not None else "run"
     chord = placement.nodes[of.j] - placement.nodes[of.i] if of.i is not None and of.j is not None else None
-    strong = strong_links(piece)
+    strong = piece.solved.map.strong
     return {
         "id": piece.solved.input.name,
         "kind": kind,

@@ -59,7 +59,7 @@ def store_edge(edge: Edge, resolution_m: float, folder: Path) -> StoredEdge:
     placed, solved = edge.placed, edge.placed.solved
     grid = draw_piece(solved.input, solved.map.firsts, placed.edge_poses, resolution_m)
     runs = np.array([span.run for span in solved.input.piece.spans])
-    shared = scale_errors(solved.map.links, solved.map.firsts, runs, edge.wheel_sigmas)
+    shared = scale_errors(solved.map, runs, edge.wheel_sigmas)
     path = folder / f"{solved.input.name}.npz"
     write_npz(
         path,
@@ -74,7 +74,7 @@ def store_edge(edge: Edge, resolution_m: float, folder: Path) -> StoredEdge:
             "link_ends": solved.map.links.ends,
             "link_motions": solved.map.links.motions,
             "link_informations": solved.map.links.informations,
-            "link_strong": strong_links(placed),
+            "link_strong": solved.map.strong,
             "link_squared_distances": solved.map.solution.squared_distances,
             "grid_log_odds": grid.log_odds,
             "grid_resolution": np.array(grid.resolution_m),
@@ -82,16 +82,6 @@ def store_edge(edge: Edge, resolution_m: float, folder: Path) -> StoredEdge:
         },
     )
     return StoredEdge(path, store_grid(grid, path.with_suffix(".npy")))
-
-
-def strong_links(piece: Placed) -> NDArray[np.bool_]:
-    """Which links are scan matches of poses that are not neighbours on a path. The others are the chain of the drive,
-    its odometry, and what a tag alone joins.
-    """
-    links = piece.solved.map.links
-    path = np.searchsorted(piece.solved.map.firsts, links.ends, side="right")
-    neighbours = (path[:, 0] == path[:, 1]) & (np.abs(links.ends[:, 1] - links.ends[:, 0]) == 1)
-    return np.asarray(links.robust & ~neighbours)
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -65,6 +65,20 @@ class PieceMap:
     def path(self, p: int) -> slice:
         return slice(int(self.firsts[p]), int(self.firsts[p + 1]))
 
+    @property
+    def in_a_row(self) -> NDArray[np.bool_]:
+        """(m,) links between neighbours on a path: the chain of the drive and its odometry."""
+        ends = self.links.ends
+        path = np.searchsorted(self.firsts, ends, side="right")
+        return np.asarray((path[:, 0] == path[:, 1]) & (np.abs(ends[:, 1] - ends[:, 0]) == 1))
+
+    @property
+    def strong(self) -> NDArray[np.bool_]:
+        """(m,) links that are scan matches of poses which are no neighbours. The others are in a row, or what a tag
+        alone joins.
+        """
+        return np.asarray(self.links.robust & ~self.in_a_row)
+
 
 @dataclass(frozen=True, slots=True)
 class Drift:

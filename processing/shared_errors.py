@@ -9,33 +9,32 @@ filter: Jazwinski 1970, section 8.4).
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.edge_map import PieceMap
 from processing.open_loop import GATE
-from processing.pose_graph import Links
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def scale_errors(links: Links, firsts: Ints, runs: Ints, sigmas: Array) -> Array:
+def scale_errors(piece: PieceMap, runs: Ints, sigmas: Array) -> Array:
     """Changes (q, m, 3) of the motions of m links, one row for each of the q runs in the piece.
 
     Args:
-        links: Of the piece: of the neighbours on a path, the fused ones are robust and those of the wheels are not.
-        firsts: (P + 1,) where each path begins.
+        piece: Of its P paths. Of the links in a row, the fused ones are robust and those of the wheels are not.
         runs: (P,) which run each path belongs to.
         sigmas: (P,) standard deviation of the scale of its distances.
     """
-    path = np.searchsorted(firsts, links.ends, side="right") - 1
-    in_a_row = (path[:, 0] == path[:, 1]) & (links.ends[:, 1] - links.ends[:, 0] == 1)
-    wheels = np.flatnonzero(in_a_row & ~links.robust)
-    fused = np.flatnonzero(in_a_row & links.robust)
-    driven = np.zeros((int(firsts[-1]), 3))  # by the wheels, from each pose to the next
-    doubt = np.full(int(firsts[-1]), np.inf)  # m², along
+    links, count = piece.links, int(piece.firsts[-1])
+    path = np.searchsorted(piece.firsts, links.ends[:, 0], side="right") - 1
+    wheels = np.flatnonzero(piece.in_a_row & ~links.robust)
+    fused = np.flatnonzero(piece.in_a_row & links.robust)
+    driven = np.zeros((count, 3))  # by the wheels, from each pose to the next
+    doubt = np.full(count, np.inf)  # m², along
     driven[links.ends[wheels, 0], :2] = links.motions[wheels, :2]
     doubt[links.ends[wheels, 0]] = np.linalg.inv(links.informations[wheels])[:, 0, 0] / GATE
     share = np.zeros(len(links))  # of the wheels in a motion: all of it where the match saw nothing along
     share[wheels] = 1.0
     left = np.linalg.inv(links.informations[fused])[:, 0, 0]
     share[fused] = np.minimum(left / doubt[links.ends[fused, 0]], 1.0)
-    moved = (share * sigmas[path[:, 0]])[:, None] * driven[links.ends[:, 0]]
-    return np.stack([np.where((runs[path[:, 0]] == run)[:, None], moved, 0.0) for run in np.unique(runs)])
+    moved = (share * sigmas[path])[:, None] * driven[links.ends[:, 0]]
+    return np.stack([np.where((runs[path] == run)[:, None], moved, 0.0) for run in np.unique(runs)])

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from processing.edge_map import PieceMap
 from processing.open_loop import GATE
-from processing.pose_graph import Links, marginal_covariances
+from processing.pose_graph import Links, marginal_covariances, solve
 from processing.shared_errors import scale_errors
 
 STEPS, NOISE_M, SIGMA = 100, 0.01, 0.002
@@ -22,7 +23,8 @@ def straight(seen_m: float, first: int = 0) -> Links:
 
 def end_variance(links: Links, firsts: list[int], runs: list[int]) -> float:
     poses = np.column_stack([np.arange(firsts[-1]) % (STEPS + 1), np.zeros((firsts[-1], 2))])
-    shared = scale_errors(links, np.array(firsts), np.array(runs), np.full(len(runs), SIGMA))
+    piece = PieceMap(poses, np.array(firsts), links, solve(poses, links))
+    shared = scale_errors(piece, np.array(runs), np.full(len(runs), SIGMA))
     return float(marginal_covariances(poses, links, np.ones(len(links)), shared)[STEPS, 0, 0])
 
 
