@@ -217,15 +217,19 @@ def _shrink(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     return out
 
 
+def scale_bar_length(across_m: float) -> float:
+    """1, 2 or 5 times a power of ten, about a fifth of what the picture is across."""
+    decade = 10.0 ** np.floor(np.log10(across_m / 5))
+    return float(decade * max(step for step in (1, 2, 5) if step * decade <= across_m / 5 * (1 + 1e-9)))
+
+
 def _draw_scale_bar(
     draw: ImageDraw.ImageDraw,
     picture: Image.Image,
     pixels_per_m: float,
     font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
 ) -> None:
-    wanted_m = (picture.width - 2 * MARGIN_PIXELS) / pixels_per_m / 5
-    decade = 10.0 ** np.floor(np.log10(wanted_m))
-    length_m = float(decade * max(step for step in (1, 2, 5) if step * decade <= wanted_m * (1 + 1e-9)))
+    length_m = scale_bar_length((picture.width - 2 * MARGIN_PIXELS) / pixels_per_m)
     x, y = 15.0, picture.height - 15.0
     end = x + length_m * pixels_per_m
     draw.line([(x, y - 5), (x, y), (end, y), (end, y - 5)], fill=INK, width=2)

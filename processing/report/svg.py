@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from processing.geometry import Array
-from processing.map_files import DARK, FREE, OCCUPIED, OPEN, UNKNOWN, WALL, MapImage
+from processing.map_files import DARK, FREE, OCCUPIED, OPEN, UNKNOWN, WALL, MapImage, scale_bar_length
 
 Box = tuple[float, float, float, float]  # least x, least y, largest x, largest y [m]
 
@@ -60,11 +60,8 @@ class Drawing:
         self.elements.append(f'<a href="#{escape(link)}">{mark}</a>' if link else mark)
 
     def scale_bar(self) -> None:
-        """A bar of 1, 2 or 5 times a power of ten, about a fifth of the drawing."""
-        wanted_m = self.size / 5
-        decade = 10.0 ** np.floor(np.log10(wanted_m))
-        length_m = float(decade * max(step for step in (1, 2, 5) if step * decade <= wanted_m * (1 + 1e-9)))
-        unit = 6 * self.size / self.shown_px
+        """A bar with its length."""
+        length_m, unit = scale_bar_length(self.size), 6 * self.size / self.shown_px
         x, y = self.box[0] + 2 * unit, self.box[1] + 2 * unit
         bar = np.array([[x, y + unit], [x, y], [x + length_m, y], [x + length_m, y + unit]])
         self.line(bar, "#141414", 2)
