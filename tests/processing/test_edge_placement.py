@@ -12,15 +12,17 @@ from numpy.testing import assert_allclose
 from processing.edge_placement import Placed, Placement, edge_frame, find_boundary, lay_side_by_side, place_by_frames
 from processing.geometry import compose, relative, transform, wrap_angle
 from processing.graph import Graph
+from processing.length_placement import place_by_lengths
 from processing.occupancy_grid import Grid
 from processing.pieces import SolvedPiece, draw_piece
 from processing.pipeline import DrivenRun, remarks
-from processing.scan_matching import match_scans
+from processing.scan_matching import Matcher, match_scans
 from processing.workers import Workers
 
 Solve = Callable[[list[DrivenRun]], tuple[Graph, list[SolvedPiece]]]
 Move = Callable[[list[Placed], list[DrivenRun]], tuple[np.ndarray, np.ndarray]]
 Solved = tuple[Graph, list[SolvedPiece]]
+Place = Callable[[list[SolvedPiece], Graph, Matcher, Workers], Placement]
 
 
 def occupied(grid: Grid) -> np.ndarray:
@@ -136,18 +138,19 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     assert sorted(placement.node_parts.tolist()) == [0] * 4 + [1] * (len(graph.nodes) - 4)
 
 
+@pytest.mark.parametrize(("place", "most_m"), [(place_by_frames, 0.1), (place_by_lengths, 0.8)])
 @pytest.mark.parametrize(("other", "tag"), [(0, 0), (1, 1)])
 def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
-    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, other: int, tag: int
+    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, other: int, tag: int, place: Place, most_m: float
 ) -> None:
     """No drive joins the two runs, only their scans at the one tag that both passed."""
     epc = sorted({found.epc for found in driven[0].passes})[tag]
     one = next(found for found in driven[other].passes if found.epc == epc)
     graph, pieces = solve_runs([replace(of, passes=[one]) if k == other else of for k, of in enumerate(driven)])
-    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
+    placement = place(pieces, graph, match_scans, Workers(1))
     assert {piece.part for piece in placement.pieces} == {0}
     assert placement.remarks == []
-    assert move_into_world(placement.pieces, driven)[1].max() < 0.1
+    assert move_into_world(placement.pieces, driven)[1].max() < most_m
 
 
 def test_a_run_without_tags_is_mapped_alone_and_told(

@@ -167,20 +167,6 @@ def test_a_run_with_one_tag_is_one_part(driven: list[DrivenRun], solve_runs: Sol
     assert_allclose(placement.nodes[0, :2], placement.pieces[0].poses[-1, :2], atol=1.0)
 
 
-@pytest.mark.parametrize(("other", "tag"), [(0, 0), (1, 1)])
-def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
-    driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, other: int, tag: int
-) -> None:
-    """No drive joins the two runs, only their scans at the one tag that both passed."""
-    epc = sorted({found.epc for found in driven[0].passes})[tag]
-    one = next(found for found in driven[other].passes if found.epc == epc)
-    graph, pieces = solve_runs([replace(of, passes=[one]) if k == other else of for k, of in enumerate(driven)])
-    placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
-    assert {piece.part for piece in placement.pieces} == {0}
-    assert placement.remarks == []
-    assert move_into_world(placement.pieces, driven)[1].max() < 0.8
-
-
 def test_a_run_without_tags_is_placed_alone(driven: list[DrivenRun], solve_runs: Solve) -> None:
     graph, pieces = solve_runs([replace(driven[1], passes=[])])
     placement = place_by_lengths(pieces, graph, match_scans, Workers(1))
