@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hw_profiles.errors import BadInputError
 from rtlog_client.drive_log import Event
 from rtlog_server.clock import WRAP_US
@@ -20,7 +18,7 @@ from rtlog_server.devices.lms111.cola import ColaError, Dialect, Receiver
 from rtlog_server.devices.lms111.protocol import decode
 from rtlog_server.devices.lms111.scan_data import ScanData
 from rtlog_server.devices.lms111.sweep import period_us, to_scan
-from rtlog_server.messages import LaserScan, header
+from rtlog_server.sampler import scan_message
 
 BINARY_START = b"\x02\x02\x02\x02"
 
@@ -64,14 +62,8 @@ def capture_events(capture: Capture, device: str) -> Iterator[Event]:
             continue
         measured = to_scan(scan, piece.elapsed_ns, period_us(scan, before))
         before = scan
-        first, step = measured.angle_min_rad, measured.angle_increment_rad
-        content = LaserScan(
-            header(max(0, measured.measured_ns), ""),
-            *(first, first + step * (len(measured.ranges_m) - 1), step, measured.time_increment_s),
-            *(measured.scan_time_s, measured.range_min_m, measured.range_max_m),
-            *(np.asarray(measured.ranges_m, np.float32), np.asarray(measured.intensities, np.float32)),
-        )
-        yield Event(measured.measured_ns, order, device, content)
+        before_zero_ns = max(0, -measured.measured_ns)  # of the first: no header can be stamped so
+        yield Event(measured.measured_ns, order, device, scan_message(measured, before_zero_ns, ""))
 
 
 def transmission_delay_ns(capture: Capture) -> int:

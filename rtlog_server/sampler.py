@@ -86,9 +86,11 @@ def _report(device: Device[Any], collected: Collected[Any]) -> DeviceReport:
 
 def laser_scan(collected: Collected[Scan], utc_offset_ns: int, frame_id: str) -> Any | None:
     """A LaserScan of the newest scan, stamped with its first ray; None without one."""
-    if not collected.samples:
-        return None
-    scan = collected.samples[-1]
+    return scan_message(collected.samples[-1], utc_offset_ns, frame_id) if collected.samples else None
+
+
+def scan_message(scan: Scan, utc_offset_ns: int, frame_id: str) -> Any:
+    """A scan as a LaserScan, stamped with its first ray."""
     return LaserScan(
         header(scan.measured_ns + utc_offset_ns, frame_id),
         scan.angle_min_rad,
