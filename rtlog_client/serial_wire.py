@@ -40,9 +40,9 @@ class SerialWire(Wire):
             self._pull()
 
     def _end(self) -> None:
-        fault, self.fault = self.fault, None
-        if fault is not None and fault.kind == "cut":
+        if self._pulled:
             self._plug_in()
+        self.fault = None
 
     def _plug_in(self) -> None:
         self._host, self._port = os.openpty()  # the port stays open: without any, the host's end reads EIO

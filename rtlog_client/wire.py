@@ -18,10 +18,12 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import ExitStack
 from typing import Any, Self
 
 from rtlog_client.faults import Fault
+from rtlog_server.devices.device import DeviceError
 
 READ_BYTES = 65536
 
@@ -36,7 +38,7 @@ class Wire(ABC):
     def __init__(self, name: str, seed: int) -> None:
         self.fault: Fault | None = None
         self.noise = random.Random(f"{seed} {name}")  # each wire its own, whatever the others carry
-        self._tasks: queue.SimpleQueue[tuple[Callable[[], None], threading.Event]] = queue.SimpleQueue()
+        self._tasks: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
         self._selector = selectors.DefaultSelector()
         self._wake, self._waker = socket.socketpair()
         self._selector.register(self._wake, selectors.EVENT_READ, self._run_tasks)
@@ -58,6 +60,7 @@ class Wire(ABC):
         self._opened.close()
 
     def begin(self, fault: Fault) -> None:
+        """Raises, as `end` does: OSError, DeviceError: an address is taken meanwhile, or gone."""
         self._call(lambda: self._begin(fault))
 
     def end(self) -> None:
@@ -94,17 +97,21 @@ class Wire(ABC):
         """Release everything."""
 
     def _call(self, function: Callable[[], None]) -> None:
-        done = threading.Event()
-        self._tasks.put((function, done))
+        task: Future[None] = Future()
+        self._tasks.put((function, task))
         self._waker.send(b"\0")
-        done.wait()
+        task.result()
 
     def _run_tasks(self) -> None:
         self._wake.recv(4096)
         while not self._tasks.empty():
-            function, done = self._tasks.get()
-            function()
-            done.set()
+            function, task = self._tasks.get()
+            try:
+                function()
+            except (OSError, DeviceError) as error:
+                task.set_exception(error)  # raised where it was asked for
+            else:
+                task.set_result(None)
 
     def _run(self) -> None:
         wait_s = None
