@@ -4,7 +4,6 @@ The host's speed is passed on, as the emulator answers only at its own. A cut pu
 up and its name is gone. In a restart the adapter stays, and nothing passes.
 """
 
-import contextlib
 import os
 import termios
 import tty
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from rtlog_client.faults import Fault
 from rtlog_client.wire import READ_BYTES, Flow, Wire
+from rtlog_server.devices.pty_link import PtyLink
 
 SPEEDS = slice(4, 6)  # of tcgetattr's list: input and output speed
 
@@ -27,42 +27,28 @@ class SerialWire(Wire):
     # In the thread
 
     def _open(self) -> None:
-        if self._link.exists() and not self._link.is_symlink():
-            raise FileExistsError(f"{self._link} is in the way and no symbolic link")
         self._device = os.open(self._target, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._device)
-        self._plug_in()
+        self._host = PtyLink(self._link)
+        self._connect()
         self._watch(self._device, self._receive_from_device)
 
     def _begin(self, fault: Fault) -> None:
         self.fault = fault
         if fault.kind == "cut":
-            self._pull()
+            self._ignore(self._host.master)
+            self._host.unplug()
 
     def _end(self) -> None:
         if self._pulled:
-            self._plug_in()
+            self._host.plug()
+            self._connect()
         self.fault = None
 
-    def _plug_in(self) -> None:
-        self._host, self._port = os.openpty()  # the port stays open: without any, the host's end reads EIO
-        tty.setraw(self._port)
-        os.set_blocking(self._host, False)
-        self._terminal = os.ttyname(self._port)
-        beside = self._link.with_name(f".{self._link.name}.{os.getpid()}")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(self._terminal)
-        beside.replace(self._link)
+    def _connect(self) -> None:
         self._to_device = Flow(lambda data: os.write(self._device, data), False)
-        self._to_host = Flow(self._write_to_host, True)
-        self._watch(self._host, self._receive_from_host)
-
-    def _pull(self) -> None:
-        self._ignore(self._host)
-        if self._link.is_symlink() and str(self._link.readlink()) == self._terminal:
-            self._link.unlink()
-        os.close(self._port)
-        os.close(self._host)
+        self._to_host = Flow(self._host.write, True)
+        self._watch(self._host.master, self._receive_from_host)
 
     @property
     def _pulled(self) -> bool:
@@ -73,7 +59,7 @@ class SerialWire(Wire):
         return self.fault is not None and self.fault.kind in ("cut", "restart")
 
     def _receive_from_host(self) -> None:
-        data = os.read(self._host, READ_BYTES)
+        data = os.read(self._host.master, READ_BYTES)
         self._pass_speed()
         if not self._dead:
             self._to_device.put(data, self)
@@ -84,14 +70,10 @@ class SerialWire(Wire):
             self._to_host.put(data, self)
 
     def _pass_speed(self) -> None:
-        wanted, present = termios.tcgetattr(self._host), termios.tcgetattr(self._device)
-        if present[SPEEDS] != wanted[SPEEDS]:
-            present[SPEEDS] = wanted[SPEEDS]
+        wanted, present = [self._host.host_speed()] * 2, termios.tcgetattr(self._device)
+        if present[SPEEDS] != wanted:
+            present[SPEEDS] = wanted
             termios.tcsetattr(self._device, termios.TCSANOW, present)
-
-    def _write_to_host(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # nobody reads: a wire does not wait
-            os.write(self._host, data)
 
     def _flush(self) -> float | None:
         if self._pulled:
@@ -101,5 +83,6 @@ class SerialWire(Wire):
 
     def _shut(self) -> None:
         if not self._pulled:
-            self._pull()
+            self._ignore(self._host.master)
+            self._host.unplug()
         os.close(self._device)

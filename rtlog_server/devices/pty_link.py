@@ -3,7 +3,7 @@
     /dev/serial/by-id/…  ~  link ──> /dev/pts/7     pulled: the terminal hangs up, its name is gone
                                 └──> /dev/pts/9     back: another terminal under the same name
 
-In: the name. Out: the master's end of the terminal. Used by emulators only.
+In: the name. Out: the master's end of the terminal. Used by emulators and by the wires before them.
 """
 
 import contextlib
