@@ -8,9 +8,9 @@ handed over is whole: hexadecimal EPC, antenna in a byte, one read or more, meas
 
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import atheris
+from fuzzing import fuzz
 
 with atheris.instrument_imports(include=["rtlog_server.devices.alien"]):
     from rtlog_server.devices.alien import protocol
@@ -99,10 +99,7 @@ def samples() -> list[bytes]:
     return [*pushed, *(f"{text}\r\n\0".encode() for text in [*texts, *settings, *lines]), commands, switches]
 
 
-def fuzz(way: str, runs: int, corpus: Path) -> None:
-    """Does not return: atheris ends the process, with an error if an input broke the law."""
-    for number, sample in enumerate(samples()):
-        (corpus / str(number)).write_bytes(sample)
+def main(way: str) -> None:
     memory = TagMemory()
 
     def try_one(data: bytes) -> None:
@@ -114,18 +111,8 @@ def fuzz(way: str, runs: int, corpus: Path) -> None:
             with suppress(AlienError):
                 try_reader(data)
 
-    arguments = [
-        f"-runs={runs}",
-        "-seed=1",
-        "-max_len=300",
-        "-len_control=0",
-        "-timeout=5",
-        "-rss_limit_mb=500",
-        "-print_final_stats=1",
-    ]
-    atheris.Setup([sys.argv[0], *arguments, str(corpus)], try_one)
-    atheris.Fuzz()
+    fuzz(try_one, samples(), longest=300)
 
 
 if __name__ == "__main__":
-    fuzz(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    main(sys.argv[1])

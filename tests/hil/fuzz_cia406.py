@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import atheris
+from fuzzing import fuzz
 
 with atheris.instrument_imports(include=["rtlog_server.devices.cia406", "canopen.sdo", "can.interfaces.slcan"]):
     from hw_profiles.profile import CanBus, Encoder
@@ -113,33 +114,22 @@ class SlcanLine:
         assert len(self.port._bus._buffer) <= LONGEST_LINE
 
 
-def fuzz(way: str, runs: int, corpus: Path, folder: Path) -> None:
-    """Does not return: atheris ends the process, with an error if an input broke the law."""
+SAMPLES = {
+    "frames": [
+        b"\0\x05\x85\x22\x01\0\0\0\x01\x86\x22\x02\0\0\0\x60\x05\x0f\x05\x05\x0f\0",
+        b"\x01\x08\x85\x21\1\0\0\0",
+    ],
+    "answers": [b"\0" + b"\1\x43\x00\x10\x00\x96\x01\x02\x00" * 3, b"\1" + b"\1\x80\x00\x10\x00\0\0\2\6" * 4],
+    "slcan": [b"t28540001AABB\rt7051\r", b"T0000028540001AABB\rr7050\r\x07Z\r\xff\r"],
+}
+
+
+def main(way: str, folder: Path) -> None:
     line = SlcanLine(folder) if way == "slcan" else None
     try_one = {"frames": try_frames, "answers": try_answers}.get(way) or line.try_bytes
-    seeds = {
-        "frames": [
-            b"\0\x05\x85\x22\x01\0\0\0\x01\x86\x22\x02\0\0\0\x60\x05\x0f\x05\x05\x0f\0",
-            b"\x01\x08\x85\x21\1\0\0\0",
-        ],
-        "answers": [b"\0" + b"\1\x43\x00\x10\x00\x96\x01\x02\x00" * 3, b"\1" + b"\1\x80\x00\x10\x00\0\0\2\6" * 4],
-        "slcan": [b"t28540001AABB\rt7051\r", b"T0000028540001AABB\rr7050\r\x07Z\r\xff\r"],
-    }
-    for number, seed in enumerate(seeds[way]):
-        (corpus / str(number)).write_bytes(seed)
-    arguments = [
-        f"-runs={runs}",
-        "-seed=1",
-        f"-max_len={LONGEST_INPUT[way]}",
-        "-len_control=0",
-        "-timeout=5",
-        "-rss_limit_mb=1000",
-        "-print_final_stats=1",
-    ]
-    atheris.Setup([sys.argv[0], *arguments, str(corpus)], try_one)
-    atheris.Fuzz()
+    fuzz(try_one, SAMPLES[way], LONGEST_INPUT[way])
 
 
 if __name__ == "__main__":
     with TemporaryDirectory() as name:
-        fuzz(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]), Path(name))
+        main(sys.argv[1], Path(name))

@@ -8,10 +8,10 @@ that it lets pass can hold up the sampler: it is complete before it was received
 
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import atheris
 import numpy as np
+from fuzzing import fuzz
 
 with atheris.instrument_imports(include=["rtlog_server.devices.lms111", "rtlog_server.clock"]):
     from rtlog_server.clock import DeviceClock
@@ -75,13 +75,11 @@ def samples(dialect: Dialect) -> list[bytes]:
     return [*telegrams, encode_scan_data(dialect, full)]
 
 
-def fuzz(way: str, runs: int, corpus: Path) -> None:
-    """Does not return: atheris ends the process, with an error if an input broke the law."""
+def main(way: str) -> None:
     kind, name = way.split("-")
     dialect = Dialect[name]
-    for number, telegram in enumerate(samples(dialect)):
-        (payload,) = Receiver(dialect).feed(telegram)
-        (corpus / str(number)).write_bytes(telegram if kind == "stream" else payload)
+    telegrams = samples(dialect)
+    payloads = [payload for telegram in telegrams for payload in Receiver(dialect).feed(telegram)]
 
     def try_one(data: bytes) -> None:
         if kind == "stream":
@@ -90,18 +88,8 @@ def fuzz(way: str, runs: int, corpus: Path) -> None:
             with suppress(ColaError):
                 try_payload(dialect, data, DeviceClock())
 
-    arguments = [
-        f"-runs={runs}",
-        "-seed=1",
-        "-max_len=800",
-        "-len_control=0",
-        "-timeout=5",
-        "-rss_limit_mb=1000",
-        "-print_final_stats=1",
-    ]
-    atheris.Setup([sys.argv[0], *arguments, str(corpus)], try_one)
-    atheris.Fuzz()
+    fuzz(try_one, telegrams if kind == "stream" else payloads, longest=800)
 
 
 if __name__ == "__main__":
-    fuzz(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    main(sys.argv[1])

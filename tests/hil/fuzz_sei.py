@@ -8,9 +8,9 @@ is made of it fits it; an encoder takes every byte in the end.
 
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import atheris
+from fuzzing import fuzz
 
 with atheris.instrument_imports(include=["rtlog_server.devices.sei", "rtlog_server.devices.encoders"]):
     from hw_profiles.profile import Encoder
@@ -81,22 +81,5 @@ def samples() -> list[bytes]:
     ]
 
 
-def fuzz(way: str, runs: int, corpus: Path) -> None:
-    """Does not return: atheris ends the process, with an error if an input broke the law."""
-    for number, sample in enumerate(samples()):
-        (corpus / str(number)).write_bytes(sample)
-    arguments = [
-        f"-runs={runs}",
-        "-seed=1",
-        "-max_len=200",
-        "-len_control=0",
-        "-timeout=5",
-        "-rss_limit_mb=500",
-        "-print_final_stats=1",
-    ]
-    atheris.Setup([sys.argv[0], *arguments, str(corpus)], try_answers if way == "answer" else try_requests)
-    atheris.Fuzz()
-
-
 if __name__ == "__main__":
-    fuzz(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))
+    fuzz(try_answers if sys.argv[1] == "answer" else try_requests, samples(), longest=200)
