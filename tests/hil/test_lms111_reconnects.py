@@ -8,7 +8,7 @@ import resource
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -42,17 +42,19 @@ def measuring(emulator: Lms111Emulator, first_rays_ns: list[int]) -> Iterator[No
 
     thread = threading.Thread(target=run)
     thread.start()
-    yield
-    stopping.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join()
 
 
 @contextmanager
 def driving(emulator: Lms111Emulator) -> Iterator[Lms111]:
     driver = Lms111("laser/primary", LaserDevice(host=emulator.address[0], port=emulator.address[1]))
     driver.start(TickGrid(0, 100_000_000))
-    yield driver
-    driver.close()
+    with closing(driver):
+        yield driver
 
 
 def wait_scans(driver: Lms111) -> list[Scan]:
