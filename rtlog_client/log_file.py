@@ -240,7 +240,12 @@ def _indexed_messages(file: BinaryIO, summary: Summary, topics: list[str] | None
         for channel in summary.channels.values()
         if topics is None or channel.topic in topics
     }
-    chunks = [c for c in summary.chunk_indexes if topics is None or channels.keys() & c.message_index_offsets.keys()]
+    chunks = [
+        chunk
+        for chunk in summary.chunk_indexes
+        # some writers leave the index of a chunk's messages out: then it may hold any
+        if not chunk.message_index_offsets or channels.keys() & chunk.message_index_offsets.keys()
+    ]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
     waiting: list[tuple[int, int, int, LoggedMessage]] = []  # what a chunk that is still to come may precede
     for chunk, following in zip_longest(chunks, chunks[1:]):

@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 
 from hw_profiles.errors import BadInputError
 from rtlog_client.log_file import LogWriter, read_info, read_messages
@@ -52,3 +55,26 @@ def test_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyError), LogWriter(tmp_path / "a.mcap", {}, None):
         raise KeyError
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("index_types", [IndexType.ALL, IndexType.ALL & ~IndexType.MESSAGE])
+@pytest.mark.parametrize("topics", [None, ["/b"], ["/b", "/c"], ["/none"]])
+def test_messages_of_others_come_in_the_order_of_mcap_s_own_reader(
+    tmp_path: Path, index_types: IndexType, topics: list[str] | None
+) -> None:
+    """Chunks that overlap in time, and equal times; with and without an index of the messages."""
+    draw = np.random.default_rng(3)
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=500, compression=CompressionType.ZSTD, index_types=index_types)
+        writer.start()
+        schema = writer.register_schema("any", "ros2msg", b"")
+        channels = [writer.register_channel(name, "cdr", schema) for name in ("/a", "/b", "/c")]
+        for k in range(300):
+            channel = channels[draw.integers(2 + (k > 250))]
+            writer.add_message(channel, int(k // 5 + draw.integers(30)), bytes(20), 7 * k, k)
+        writer.finish()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        expected = [(c.topic, m.log_time, m.sequence) for _, c, m in make_reader(file).iter_messages(topics=topics)]
+    found = [(m.topic, m.log_time_ns, m.sequence) for m in read_messages(tmp_path / "a.mcap", topics)]
+    assert found == expected
+    assert bool(found) == (topics != ["/none"])
