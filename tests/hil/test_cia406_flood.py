@@ -8,50 +8,19 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import can
 import pytest
 import zenoh
 
-from hw_profiles.profile import CanBus
+from hw_profiles.profile import CanBus, load_profile
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
 
 FLOOD_S = 20.0
 FRAMES_PER_S = 4000  # as many as 500 kbit/s can carry
 BACK_S = 2.0
-PROFILE = """\
-schema = 1
-name = "flooded"
-[vehicle]
-kinematics = "differential"
-track_width_m = 1.6
-[lasers.primary]
-device = {{ host = "127.0.0.1", port = 1 }}
-[[encoders]]
-name = "left_wheel"
-role = "left_wheel"
-wheel_radius_m = 0.35
-address = 5
-[[encoders]]
-name = "right_wheel"
-role = "right_wheel"
-wheel_radius_m = 0.35
-address = 6
-[encoder_bus]
-kind = "can"
-interface = "udp_multicast"
-channel = "239.74.163.2"
-udp_port = {can_port}
-[zenoh]
-listen = ["tcp/127.0.0.1:{zenoh_port}"]
-"""
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
 
 
 def flood(bus: CanBus, stopping: threading.Event) -> int:
@@ -77,7 +46,7 @@ def flood(bus: CanBus, stopping: threading.Event) -> int:
 
 
 def status(session: zenoh.Session) -> dict:
-    reply = next(iter(session.get("rtlog/flooded/@status", timeout=5.0))).ok
+    reply = next(iter(session.get("rtlog/bench/@status", timeout=5.0))).ok
     assert reply is not None
     return json.loads(reply.payload.to_string())
 
@@ -97,17 +66,15 @@ def wait_until_well(session: zenoh.Session, limit_s: float) -> float:
 
 
 @pytest.mark.timeout(120)
-def test_a_flood_on_the_bus_costs_no_tick(tmp_path: Path) -> None:
-    bus = CanBus(interface="udp_multicast", channel="239.74.163.2", udp_port=free_port(socket.SOCK_DGRAM))
-    zenoh_port = free_port(socket.SOCK_STREAM)
-    profile = tmp_path / "flooded.toml"
-    profile.write_text(PROFILE.format(can_port=bus.udp_port, zenoh_port=zenoh_port))
+def test_a_flood_on_the_bus_costs_no_tick(make_rig: Callable[..., Any]) -> None:
+    rig = make_rig(can=True)
+    bus = load_profile(rig.profile).encoder_bus
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{zenoh_port}"]')
+    config.insert_json5("connect/endpoints", f'["{rig.endpoint}"]')
     config.insert_json5("connect/timeout_ms", "10000")
     config.insert_json5("scouting/multicast/enabled", "false")
-    command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
+    command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(rig.profile)]
     stopping = threading.Event()
     sent: list[int] = []
     flooding = threading.Thread(target=lambda: sent.append(flood(bus, stopping)))

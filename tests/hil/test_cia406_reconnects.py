@@ -24,9 +24,7 @@ ENCODERS = [
 ]
 RECONNECTS = {"virtual": 100, "udp_multicast": 1000, "slcan": 300}
 WARM_UP = 20
-GROWTH_BYTES = (
-    4_000_000  # of a process that has just warmed up; a leak of a reconnect's frames would be several times that
-)
+GROWTH_BYTES = 4_000_000  # of a process that has just warmed up; a leak of a reconnect's frames is several times that
 
 
 def bus_of(interface: str, folder: Path) -> CanBus:
