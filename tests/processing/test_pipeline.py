@@ -13,7 +13,7 @@ import pytest
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
 from processing.atlas import Atlas, read_document
-from processing.geometry import align, compose, transform, wrap_angle
+from processing.geometry import align, compose, wrap_angle
 from processing.pieces import drift_suffix
 from processing.pipeline import Config, build
 from processing.tum import read_tum
@@ -63,18 +63,32 @@ def test_one_process_or_two_give_the_same_bytes(one_process: Path, small_atlas: 
         assert (one_process / name).read_bytes() == (small_atlas / name).read_bytes(), name
 
 
-def test_the_walls_close_and_the_drive_is_the_true_one(atlas: Atlas, small_world: Path) -> None:
+def worst(atlas: Atlas, world: Path) -> tuple[float, float]:
+    """How far off the worst pose of all runs is [m, rad], once all are moved as one onto the truth."""
     true, estimated = [], []
     for run_id, (stamps, poses) in atlas.trajectories.items():
-        true_stamps, true_poses = read_tum(small_world / f"{run_id}.tum")
+        true_stamps, true_poses = read_tum(world / f"{run_id}.tum")
         assert np.isin(stamps, true_stamps).all()
         true.append(true_poses[np.searchsorted(true_stamps, stamps)])
         estimated.append(poses)
-    into_world = align(np.concatenate(estimated)[:, :2], np.concatenate(true)[:, :2])
-    errors = transform(into_world, np.concatenate(estimated)[:, :2]) - np.concatenate(true)[:, :2]
-    assert np.hypot(*errors.T).max() < 0.25
-    turned = compose(into_world, np.concatenate(estimated))[:, 2]
-    assert np.abs(wrap_angle(turned - np.concatenate(true)[:, 2])).max() < np.radians(1.5)
+    wanted, found = np.concatenate(true), np.concatenate(estimated)
+    errors = compose(align(found[:, :2], wanted[:, :2]), found) - wanted
+    return float(np.hypot(*errors[:, :2].T).max()), float(np.abs(wrap_angle(errors[:, 2])).max())
+
+
+def test_the_walls_close_and_the_drive_is_the_true_one(atlas: Atlas, small_world: Path) -> None:
+    metres, radians = worst(atlas, small_world)
+    assert metres < 0.05
+    assert radians < np.radians(0.5)
+
+
+@pytest.mark.parametrize(("choice", "most_m"), [(Config(matcher="psm"), 0.05), (Config(assembly="paper"), 0.5)])
+def test_the_papers_matcher_and_its_assembly_find_the_drive_too(
+    choice: Config, most_m: float, recordings: list[Path], small_world: Path, tmp_path: Path
+) -> None:
+    metres, radians = worst(build(recordings, None, choice, tmp_path / "paper.atlas"), small_world)
+    assert metres < most_m
+    assert radians < np.radians(1.5)
 
 
 def test_every_scan_and_every_reading_has_a_pose(atlas: Atlas, recordings: list[Path]) -> None:
