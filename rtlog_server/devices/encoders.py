@@ -1,4 +1,4 @@
-"""What every encoder driver shares: the reading, counting on over many turns, and radians.
+"""What every encoder driver shares: its frame, the reading, counting on over many turns, and radians.
 
 In: counts within a turn, and when they were latched. Out: `EncoderReading`; wheels count on over many turns, steering
 is signed about its zero (`contracts.md`: JointState).
@@ -20,7 +20,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hw_profiles.profile import Encoder
+from rtlog_server.devices.device import Device, TickGrid
 
+STALE_S, STALE_TICKS = 0.35, 3  # without a reading, the longer of the two
 MAX_SPEED_M_S = 5.0  # of a wheel whose speed is not known yet
 MAX_ACCELERATION_M_S2 = 5.0  # more than loose ground lets any wheel brake by; one that spins on it comes out doubtful
 MARGIN_TURNS = 0.1  # what the jitter of stamps and speed may add to a movement
@@ -47,6 +49,17 @@ class EncoderReading:
     counts: tuple[int, ...]  # as the encoder counts: wheels over many turns, steering within its turn
     positions_rad: tuple[float, ...]  # at measured_ns; wheels over many turns, steering -π … π; ahead, left positive
     doubtful: tuple[str, ...]  # wheels that may have turned more often since their last reading than `counts` says
+
+
+class EncoderDevice(Device[EncoderReading]):
+    """The frame of every encoder driver: a reading a tick, so how long it may be silent hangs on the period."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, STALE_S)
+
+    def start(self, grid: TickGrid) -> None:
+        self._stale_after_ns = max(self._stale_after_ns, STALE_TICKS * grid.period_ns)
+        super().start(grid)
 
 
 def nearest_total(raw: int, modulus: int, near: int) -> int:

@@ -1,6 +1,8 @@
 """Counting on over many turns, and the angles that JointState tells."""
 
 import math
+import threading
+import time
 from itertools import pairwise
 
 import pytest
@@ -8,7 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw_profiles.profile import Encoder
-from rtlog_server.devices.encoders import Fix, ReadingMaker, TurnCounter, counts_at, nearest_total, position_rad
+from rtlog_server.devices.device import TickGrid
+from rtlog_server.devices.encoders import (
+    EncoderDevice,
+    Fix,
+    ReadingMaker,
+    TurnCounter,
+    counts_at,
+    nearest_total,
+    position_rad,
+)
+from rtlog_server.messages import OK, STALE
 
 COUNTS = 4096
 RADIUS_M = 0.35
@@ -136,3 +148,33 @@ def test_a_wrong_answer_does_not_set_a_wheel_turning_for_ever(wrong_rad: float, 
     totals = [counter.count(tick * per_tick % COUNTS, tick * TICK_NS)[0] for tick in range(11, 30)]
     assert {b - a for a, b in pairwise(totals)} == {per_tick}
     assert abs(totals[-1] - 29 * per_tick) <= COUNTS
+
+
+class Wordless(EncoderDevice):
+    """Connected, and never a reading."""
+
+    def __init__(self) -> None:
+        super().__init__("encoders")
+        self.serving = threading.Event()
+
+    def connect(self) -> None:
+        pass
+
+    def read(self) -> None:
+        self.serving.set()
+        self.pause(0.01)
+
+    def disconnect(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("period_ms", "patience_ms"), [(10, 350), (100, 350), (1000, 3000)])
+def test_encoders_are_stale_after_three_ticks_but_not_too_soon(period_ms: int, patience_ms: int) -> None:
+    device = Wordless()
+    before_ns = time.monotonic_ns()
+    device.start(TickGrid(before_ns, period_ms * 1_000_000))
+    assert device.serving.wait(10.0)
+    after_ns = time.monotonic_ns()
+    assert device.collect(before_ns + (patience_ms - 1) * 1_000_000).state == OK
+    assert device.collect(after_ns + (patience_ms + 1) * 1_000_000).state == STALE
+    device.close()

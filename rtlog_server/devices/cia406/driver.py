@@ -21,15 +21,15 @@ from rtlog_server.devices.cia406.port import CanPort
 from rtlog_server.devices.cia406.protocol import CanOpenError
 from rtlog_server.devices.cia406.rounds import SyncRounds, TimerRounds
 from rtlog_server.devices.cia406.sdo import NodeObjects, NodeSilentError
-from rtlog_server.devices.device import Device, DeviceError, TickGrid
-from rtlog_server.devices.encoders import EncoderReading, Fix, ReadingMaker
+from rtlog_server.devices.device import DeviceError
+from rtlog_server.devices.encoders import EncoderDevice, Fix, ReadingMaker
 
 SERVICES = (protocol.EMCY, *protocol.TPDO.values(), protocol.SDO_REPLY, protocol.HEARTBEAT)
 READ_NS = 200_000_000  # how long `read` serves the bus
 TALLIED = ("restarts", "missed", "emergencies", "doubtful turns", "garbled")
 
 
-class Cia406Encoders(Device[EncoderReading]):
+class Cia406Encoders(EncoderDevice):
     """All CiA 406 encoders of the bus.
 
     An encoder that does not answer, or is not what the profile says, is left out of the readings, named in `message`,
@@ -37,15 +37,11 @@ class Cia406Encoders(Device[EncoderReading]):
     """
 
     def __init__(self, name: str, bus: CanBus, encoders: Sequence[Encoder]) -> None:
-        super().__init__(name, stale_after_s=0.35)
+        super().__init__(name)
         self._bus = bus
         self._nodes = Nodes(encoders)
         self._maker = ReadingMaker(encoders, {encoder.name: encoder.counts_per_turn for encoder in encoders})
         self._port: CanPort | None = None
-
-    def start(self, grid: TickGrid) -> None:
-        self._stale_after_ns = max(self._stale_after_ns, 3 * grid.period_ns)
-        super().start(grid)
 
     def connect(self) -> None:
         self._port = CanPort(self._bus, [service + node for service in SERVICES for node in self._nodes.addresses])

@@ -20,8 +20,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 from hw_profiles.profile import Encoder, SeiBus
-from rtlog_server.devices.device import Device, DeviceError, TickGrid
-from rtlog_server.devices.encoders import EncoderReading, Fix, ReadingMaker
+from rtlog_server.devices.device import DeviceError
+from rtlog_server.devices.encoders import EncoderDevice, Fix, ReadingMaker
 from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.identity import identify_encoder
 from rtlog_server.devices.sei.port import SeiPort
@@ -34,7 +34,7 @@ AGREEMENT_TURNS = 0.02  # two answers in one round that differ by less are no no
 EVENTS = ("retries", "timeouts", "garbled", "impossible", "doubtful turns")
 
 
-class SeiEncoders(Device[EncoderReading]):
+class SeiEncoders(EncoderDevice):
     """All US Digital A2 encoders of the bus.
 
     An encoder that does not answer, or from where its wheel cannot be, is asked once more. One that is silent is then
@@ -42,7 +42,7 @@ class SeiEncoders(Device[EncoderReading]):
     """
 
     def __init__(self, name: str, bus: SeiBus, encoders: Sequence[Encoder]) -> None:
-        super().__init__(name, stale_after_s=0.35)
+        super().__init__(name)
         self._bus = bus
         self._encoders = list(encoders)
         # A profile with a bus was checked to hold every address.
@@ -61,10 +61,6 @@ class SeiEncoders(Device[EncoderReading]):
         self._measured_before_ns: int | None = None
         self._tally: Counter[str] = Counter()
         self._last_garbled = self._last_doubtful = "none"
-
-    def start(self, grid: TickGrid) -> None:
-        self._stale_after_ns = max(self._stale_after_ns, 3 * grid.period_ns)
-        super().start(grid)
 
     def connect(self) -> None:
         self._port = SeiPort(self._bus)
