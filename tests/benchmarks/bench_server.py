@@ -15,6 +15,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from emulated_vehicle import emulated_vehicle, running_server
+from table import Figure, report
 
 from rtlog_server.messages import decode, to_ns
 
@@ -94,15 +95,15 @@ def main() -> int:
         # what else the machine does at that moment can only make a start longer
         starts_s = [start_s(profile) for _ in range(STARTS)]
         figures = measure(profile, seconds)
-    rows = [
-        ("CPU, % of one core", 100 * figures["cpu"], 100 * MOST_CPU),
-        ("memory, MB RSS", figures["rss_mb"], MOST_RSS_MB),
-        ("first tick after, s", min(starts_s), MOST_START_S),
-    ]
-    print(f"full suite, {figures['rate_hz']:.0f} samples/s out, {figures['pss_mb']:.0f} MB PSS, {seconds:.0f} s")
-    for name, value, most in rows:
-        print(f"{name:22} {value:7.2f}   at most {most:6.1f}   {'pass' if value <= most else 'FAIL'}")
-    return 0 if all(value <= most for _, value, most in rows) else 1
+    return report(
+        f"full suite, {figures['rate_hz']:.0f} samples/s out, {seconds:.0f} s",
+        [
+            Figure("CPU of one core", 100 * figures["cpu"], "%", most=100 * MOST_CPU),
+            Figure("memory, RSS", figures["rss_mb"], "MB", most=MOST_RSS_MB),
+            Figure("memory, PSS", figures["pss_mb"], "MB"),
+            Figure("first tick after", min(starts_s), "s", most=MOST_START_S),
+        ],
+    )
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from emulated_vehicle import ask_status, emulated_vehicle, running_server
 from numpy.typing import NDArray
+from table import Figure, report
 
 from rtlog_server.messages import decode
 from rtlog_server.realtime import PRIORITY
@@ -107,7 +108,7 @@ def main() -> int:
     seconds = 60 * parser.parse_args().minutes
     with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:  # /tmp may be memory, which is no disk
         ticks, status, theirs, what = measure(Path(folder), seconds)
-    if not status["realtime"]["scheduler"].startswith("SCHED_FIFO 8"):
+    if not status["realtime"]["scheduler"].startswith(f"SCHED_FIFO {PRIORITY}"):
         print(f"not judged: {status['realtime']['scheduler']} (root, or the unit, is granted it)")
         return 0
     ours = np.array([tick.lateness for tick in ticks]) * 1e3
@@ -118,15 +119,13 @@ def main() -> int:
             print(f"{name:12} " + " ".join(f"{q:7.3f}" for q in np.quantile(lateness, [0.5, 0.99, 0.999, 1.0])))
     indices = [tick.index for tick in ticks]
     missed = indices[-1] - indices[0] + 1 - len(indices) + int(np.count_nonzero(ours >= TICK_MS))
-    rows = [("missed ticks", float(missed), 0.0)]
+    figures = [Figure("missed ticks", missed, most=0)]
     if theirs is None:
         print("not compared: no cyclictest here (apt-get install rt-tests)")
     else:
         allowed_ms = MOST_RATIO * float(np.quantile(theirs, 0.999)) + MOST_BEYOND_MS
-        rows.append(("our p99, ms", float(np.quantile(ours, 0.99)), allowed_ms))
-    for name, value, most in rows:
-        print(f"{name:12} {value:7.3f}   at most {most:7.3f}   {'pass' if value <= most else 'FAIL'}")
-    return 0 if all(value <= most for _, value, most in rows) else 1
+        figures.append(Figure("our p99", float(np.quantile(ours, 0.99)), "ms", most=allowed_ms))
+    return report("rtlog-server beside cyclictest", figures)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The table that a benchmark of the mapper prints, and its exit status."""
+"""The table that a benchmark prints, and its exit status."""
 
 from dataclasses import dataclass
 
