@@ -134,7 +134,8 @@ def _info(args: argparse.Namespace) -> None:
 def _report(args: argparse.Namespace) -> None:
     from processing.report.page import write_report
 
-    output = args.output or args.atlas.with_name(f"{args.atlas.resolve().stem}.report.html")
+    atlas = args.atlas.resolve()  # also where it is called `.`
+    output = args.output or atlas.parent / f"{atlas.stem}.report.html"
     write_report(args.atlas, output)
     print(f"{output}: open it in a browser")
 

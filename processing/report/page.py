@@ -62,7 +62,7 @@ def make_page(atlas: Path) -> str:
     numbers = {run_id: number for number, run_id in enumerate(trails)}
     edges = [(edge, read_edge_arrays(atlas / "edges" / f"{edge['id']}.npz", SHOWN)) for edge in document["edges"]]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        name=escape(atlas.name),
+        name=escape(atlas.resolve().name),
         summary=_summary(document, trails),
         overview=draw_overview(document, image, trails),
         remarks=_items(caveats(document)) or "<li>Nothing: all of every run is in the map.</li>",
