@@ -25,11 +25,11 @@ def open_devices(profile: Profile) -> list[Device[Any]]:
             devices.append(Lms111(f"laser/{name}", laser.device))
     if profile.encoders:
         if profile.encoder_bus is None:
-            raise _lacks(profile, "[encoder_bus] with the encoders' port")
+            raise _lacks(profile, "[encoder_bus] with the bus's port or channel")
         devices.append(_open_encoders(profile.encoder_bus, profile.encoders))
     if profile.rfid is not None:
         if profile.rfid.device is None:
-            raise _lacks(profile, "[rfid.device] with the reader's host")
+            raise _lacks(profile, "[rfid.device] with the reader's host or serial port")
         devices.append(Alr9650("rfid", profile.rfid.device))
     return devices
 
