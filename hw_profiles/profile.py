@@ -216,8 +216,8 @@ def _problems(profile: Profile) -> Iterator[str]:
         yield f"encoders share a name: {names}"
     for index, encoder in enumerate(profile.encoders):
         where = f"encoders[{index}]"
-        if not 2 <= encoder.counts_per_turn <= 65536 * 65536:
-            yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; it must be 2 or more"
+        if not 2 <= encoder.counts_per_turn <= 1 << 32:
+            yield f"{where}.counts_per_turn is {encoder.counts_per_turn}; it must lie in 2 … {1 << 32}"
         if encoder.role != "steering" and not (encoder.wheel_radius_m or 0) > 0:
             yield f"{where}.wheel_radius_m is {encoder.wheel_radius_m}; a wheel needs it above 0"
     reader = profile.rfid.device if profile.rfid is not None else None
