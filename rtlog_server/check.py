@@ -21,9 +21,8 @@ from rtlog_server.devices.lms111.check import check_scanner
 from rtlog_server.devices.sei.check import check_bus
 from rtlog_server.finding import Finding
 
-TIME_LIMIT_S = (
-    5.0  # to connect: an encoder bus left at the wrong speed takes a second attempt, a scanner starts its motor
-)
+# To connect: an encoder bus left at the wrong speed takes a second attempt, a scanner starts its motor.
+TIME_LIMIT_S = 5.0
 WATCH_S = 2.0  # over which rates are measured, or three ticks
 RATE_TOLERANCE = 0.2
 POLL_S = 0.02
