@@ -131,7 +131,7 @@ def test_joint_states_are_the_positions_at_the_tick(listener: Listener, emulator
     states = encoder_states(listener)
     since = states[states.index(OK) :]
     assert set(since) <= {OK, STALE}
-    assert since.count(STALE) <= len(since) // 5  # on a busy machine a position comes after its tick now and then
+    assert since.count(STALE) <= len(since) // 5  # a busy machine may hold up three rounds of answers
 
 
 def test_without_a_can_bus_in_the_profile_python_can_is_not_loaded() -> None:
