@@ -99,7 +99,7 @@ class CanBus(Record, frozen=True, tag_field="kind", tag="can"):
 
     channel: str  # socketcan: network interface; slcan: serial port; udp_multicast: group; virtual: any name
     interface: Literal["socketcan", "slcan", "udp_multicast", "virtual"] = "socketcan"
-    bitrate: Literal[10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 1_000_000] = 500_000  # set outside but for slcan
+    bitrate: Literal[10_000, 20_000, 50_000, 125_000, 250_000, 500_000, 1_000_000] = 500_000  # socketcan: set outside
     udp_port: int = 43113
     trigger: Literal["sync", "timer"] = "sync"  # positions latched at our SYNC, or sent by the encoders' own clocks
     timer_ms: int = 10  # of trigger = "timer"
