@@ -145,9 +145,9 @@ class Device(ABC, Generic[SampleT]):
         while not self._stopping.is_set():
             try:
                 self.connect()
+                self.heard()  # first: connected and long unheard of, it would be stale to a tick in between
                 self.connected, self.message, retry_s = True, "connected", RETRY_FIRST_S
                 self.connects += 1
-                self.heard()
                 log.info("%s: connected %s", self.name, self.identity)
                 while not self._stopping.is_set():
                     self.read()
