@@ -12,10 +12,15 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
+from hw_profiles.profile import CanBus
+from rtlog_client.can_wire import CanWire
 from rtlog_client.faults import Fault
 from rtlog_client.serial_wire import SerialWire
 from rtlog_client.tcp_wire import TcpWire
+from rtlog_server.devices.cia406.port import CanPort
+from rtlog_server.devices.cia406.protocol import Frame
 
 PATIENCE_S = 10.0
 
@@ -286,3 +291,36 @@ def test_what_is_no_link_is_left_alone(tmp_path: Path, terminal: int) -> None:
     with pytest.raises(FileExistsError, match="in the way"), SerialWire("e", tmp_path / "port", tmp_path / "device"):
         pass
     assert (tmp_path / "port").read_text() == "somebody's"
+
+
+# CAN
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_frames_pass_both_ways_on_can_and_none_in_a_cut() -> None:
+    bus = CanBus(channel="239.74.163.2", interface="udp_multicast", udp_port=free_udp_port())
+    beyond = replace(bus, udp_port=free_udp_port())
+    with CanWire("encoders", bus, beyond.udp_port) as wire, ExitStack() as stack:
+        host, device = CanPort(bus), CanPort(beyond)
+        stack.callback(host.close)
+        stack.callback(device.close)
+
+        def passes(sender: CanPort, receiver: CanPort, frame: Frame, within_s: float) -> bool:
+            sender.send(frame)
+            deadline = time.monotonic() + within_s
+            while (received := receiver.receive(max(0.0, deadline - time.monotonic()))) is not None:
+                if (received[0].can_id, received[0].data) == (frame.can_id, frame.data):  # it hears its own as well
+                    return True
+            return False
+
+        assert passes(host, device, Frame(0x605, b"\x40\x00\x10"), PATIENCE_S)
+        assert passes(device, host, Frame(0x185, bytes(8)), PATIENCE_S)
+        wire.begin(fault("cut"))
+        assert not passes(device, host, Frame(0x185, b"\x01"), 0.2)
+        wire.end()
+        assert passes(device, host, Frame(0x185, b"\x02"), PATIENCE_S)

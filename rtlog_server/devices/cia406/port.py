@@ -54,6 +54,12 @@ class CanPort:
             with contextlib.suppress(OSError):
                 serial_port.close()
 
+    def fileno(self) -> int:
+        """To wait on with others, as a selector does. Raises: ValueError: the interface has none."""
+        if self._fileno is None:
+            raise ValueError(f"{self._place}: nothing to wait on")
+        return self._fileno
+
     def send(self, frame: Frame) -> int:
         """Send; returns when it went (the moment before: afterwards other threads may hold this one up)."""
         message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
