@@ -32,6 +32,7 @@ READ_NS = 40_000_000  # before the tick
 BEAMS = 541
 EPCS = ("E2003411B802011526370494", "E2003411B802011526370495")
 NOTHING = np.empty(0)
+WALL_MM = np.random.default_rng(1).integers(500, 15_000, BEAMS).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -47,29 +48,33 @@ class Drive:
     gap: tuple[int, int] = (0, 0)  # ticks without scans, the last one excluded
 
     def write(self, path: Path) -> None:
-        base = np.random.default_rng(1).integers(500, 15_000, BEAMS).astype(np.float32)
         with LogWriter(path, {"vehicle": "bench"}, None) as log:
             for k in range(round(self.seconds * 1e9) // PERIOD_NS):
                 tick_ns = START_NS + k * PERIOD_NS
-                for topic, message, log_ns in [*self._scans(k, tick_ns, base), *_tick(k, tick_ns)]:
+                for topic, message, log_ns in [*self._scans(k, tick_ns), *_tick(k, tick_ns)]:
                     stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
                     log.write(topic.name, topic.msgtype, encode(message), log_ns, stamp_ns)
 
-    def _scans(self, k: int, tick_ns: int, base: Any) -> Iterator[tuple[Any, Any, int]]:
+    def _scans(self, k: int, tick_ns: int) -> Iterator[tuple[Any, Any, int]]:
         per_tick = 0 if self.gap[0] <= k < self.gap[1] else self.scan_hz // 10
         for part in range(per_tick):
             first_ns = tick_ns - BEFORE_TICK_NS - SWEEP_NS - (per_tick - 1 - part) * TURN_NS
             for number, topic in enumerate(self.lasers):
                 count = (k * per_tick + part) * len(self.lasers) + number
-                millimetres = np.roll(base, 7 * count)
-                millimetres[count % BEAMS] = np.inf
-                millimetres[0] = 1000 + count % 20_000  # no two within a while are alike
                 scan = LaserScan(
                     header(first_ns, "laser"),
                     *(np.radians(-135.0), np.radians(135.0), np.radians(0.5), 0.02 / 720, 0.02, 0.016, 20.0),
-                    *(millimetres / np.float32(1000), np.float32(NOTHING)),
+                    *(ranges_m(count), np.float32(NOTHING)),
                 )
                 yield topic, scan, tick_ns if self.scan_hz == 10 else first_ns + SWEEP_NS
+
+
+def ranges_m(count: int) -> Any:
+    """(BEAMS,) of the scan of this number: no two within a while are alike."""
+    millimetres = np.roll(WALL_MM, 7 * count)
+    millimetres[count % BEAMS] = np.inf
+    millimetres[0] = 1000 + count % 20_000
+    return millimetres / np.float32(1000)
 
 
 def wheel_angles(elapsed_s: float) -> list[float]:

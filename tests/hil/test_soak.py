@@ -3,7 +3,6 @@
 Two scanners at 50 Hz, two encoders, a reader. `--soak-s 60` is a short one. It prints its figures.
 """
 
-import contextlib
 import random
 import signal
 import threading
@@ -73,16 +72,6 @@ class MemoryWatch(threading.Thread):
         return float(slope), float(rows[0, 1]), float(rows[-1, 1])
 
 
-def publishing_child(pid: int) -> int:
-    """The other process of the server: of its children, not the one that minds multiprocessing's resources."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):  # it has just ended
-            parent = int(stat.read_text().rsplit(")", 1)[1].split()[1])
-            if parent == pid and b"resource_tracker" not in (stat.parent / "cmdline").read_bytes():
-                return int(stat.parent.name)
-    raise AssertionError("the server has no publishing process")
-
-
 @pytest.mark.timeout(3600)
 def test_soak(make_rig: Any, make_drive: Any, two_lasers: Any, request: pytest.FixtureRequest, capsys: Any) -> None:
     seconds = request.config.getoption("--soak-s")
@@ -92,8 +81,8 @@ def test_soak(make_rig: Any, make_drive: Any, two_lasers: Any, request: pytest.F
     with ExitStack() as stack:
         server, recorder = stack.enter_context(rig.running())
         replay = stack.enter_context(rig.replay(recording, faults))
-        pids = {"sampling": server.popen.pid, "publishing": publishing_child(server.popen.pid)}
-        watch = MemoryWatch(pids | {"recorder": recorder.popen.pid})
+        pids = {"sampling": server.popen.pid, "publishing": server.child(), "recorder": recorder.popen.pid}
+        watch = MemoryWatch(pids)
         watch.start()
         report = replay.finish(timeout_s=seconds + 120)
         watch.stop()
