@@ -115,7 +115,9 @@ def test_it_is_started_anew_when_killed(report: dict[str, Any]) -> None:
     assert report["after_kill"] == {"NRestarts": "2", "ActiveState": "active"}
 
 
-def test_it_stops_cleanly(report: dict[str, Any]) -> None:
+def test_it_stops_cleanly(report: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    with capsys.disabled():
+        print("\nseconds: " + ", ".join(f"{name[:-2]} {report[name]:.1f}" for name in report if name.endswith("_s")))
     assert report["after_stop"] == {"ActiveState": "inactive", "Result": "success", "ExecMainStatus": "0"}
     assert report["stop_s"] < 5
 
