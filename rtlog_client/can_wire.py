@@ -5,6 +5,7 @@ passes.
 """
 
 import struct
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -18,6 +19,7 @@ from rtlog_server.devices.cia406.protocol import Frame
 from rtlog_server.devices.device import DeviceError
 
 HEAD = struct.Struct("<H")  # the identifier, before the data
+MOST_SENT = 256  # frames that a port may be still to hear of its own
 
 
 class CanWire(Wire):
@@ -31,8 +33,9 @@ class CanWire(Wire):
 
     def _open(self) -> None:
         self._host, self._device = map(CanPort, self._buses)
-        self._to_device = Flow(_sender(self._device), False)
-        self._to_host = Flow(_sender(self._host), True)
+        self._sent: dict[CanPort, deque[bytes]] = {port: deque(maxlen=MOST_SENT) for port in (self._host, self._device)}
+        self._to_device = Flow(self._sender(self._device), False)
+        self._to_host = Flow(self._sender(self._host), True)
         self._watch(self._host, lambda: self._take(self._host, self._to_device))
         self._watch(self._device, lambda: self._take(self._device, self._to_host))
 
@@ -48,9 +51,21 @@ class CanWire(Wire):
 
     def _take(self, port: CanPort, flow: Flow) -> None:
         received = port.receive(0.0)
-        if received is not None and not (self.fault is not None and self.fault.kind in ("cut", "restart")):
-            frame, _ = received
-            flow.put(HEAD.pack(frame.can_id) + frame.data, self)
+        if received is None:
+            return
+        data = HEAD.pack(received[0].can_id) + received[0].data
+        if data in self._sent[port]:  # multicast brings back what we sent: it must not go round for ever
+            self._sent[port].remove(data)
+        elif not (self.fault is not None and self.fault.kind in ("cut", "restart")):
+            flow.put(data, self)
+
+    def _sender(self, port: CanPort) -> Callable[[bytes], None]:
+        def send(data: bytes) -> None:
+            with suppress(DeviceError):  # nobody listens: a bus does not care
+                port.send(Frame(HEAD.unpack_from(data)[0], data[HEAD.size :]))
+                self._sent[port].append(data)
+
+        return send
 
     def _flush(self) -> float | None:
         waits_s = [self._to_device.flush(), self._to_host.flush()]
@@ -60,11 +75,3 @@ class CanWire(Wire):
         for port in (self._host, self._device):
             self._ignore(port)
             port.close()
-
-
-def _sender(port: CanPort) -> Callable[[bytes], None]:
-    def send(data: bytes) -> None:
-        with suppress(DeviceError):  # nobody listens: a bus does not care
-            port.send(Frame(HEAD.unpack_from(data)[0], data[HEAD.size :]))
-
-    return send
