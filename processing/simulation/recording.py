@@ -17,7 +17,7 @@ from hw_profiles.profile import Profile
 from processing.simulation import sensors
 from processing.simulation.drive import Drive
 from processing.simulation.raycast import SegmentGrid
-from processing.simulation.world import Noise, Tag
+from processing.simulation.world import Noise, Scanner, Tag
 from rtlog_client.log_file import LogWriter
 from rtlog_server import messages, topics
 
@@ -30,6 +30,7 @@ LATENESS_NS = (20_000, 200_000)  # of a tick, on an idle board
 class Samples:
     """What was sampled, one row a tick; times in seconds since the first tick."""
 
+    scanner: Scanner
     tick_s: Array  # (n,)
     sweep_s: Array  # (n,) first ray
     ranges: NDArray[np.float32]  # (n, beams) metres
@@ -47,6 +48,7 @@ def sample_drive(
     profile: Profile,
     tags: list[Tag],
     places: Array,
+    scanner: Scanner,
     noise: Noise,
     generators: dict[str, np.random.Generator],
 ) -> Samples:
@@ -55,17 +57,17 @@ def sample_drive(
     tick_s = np.asarray(
         np.arange(int(drive.duration_s / profile.tick_period_s) + 1) * profile.tick_period_s, dtype=float
     )
-    sweep_s = sensors.sweep_times(tick_s, clock.uniform(0.0, sensors.SWEEP_PERIOD_S))
+    sweep_s = sensors.sweep_times(tick_s, clock.uniform(0.0, sensors.SWEEP_PERIOD_S), scanner)
     latched_s = tick_s - sensors.ENCODER_LATENCY_S + clock.uniform(-1e-3, 1e-3, len(tick_s))
     mount = profile.lasers.primary.mount
-    ranges = sensors.simulate_sweeps(drive, grid, mount, sweep_s, noise.range_m, generators["laser"])
+    ranges = sensors.simulate_sweeps(drive, grid, scanner, mount, sweep_s, noise.range_m, generators["laser"])
     positions = sensors.simulate_encoders(drive, profile, latched_s, noise, generators["encoders"])
     phase_s = clock.uniform(-sensors.ROUND_PERIOD_S, 0.0) - profile.tick_period_s
     missed = noise.missed_pass_probability
     round_s, readings = sensors.simulate_reads(drive, tags, places, tick_s, phase_s, missed, generators["rfid"])
     lost = generators["losses"].random((2, len(tick_s)))
     has_scan, is_recorded = lost[0] >= noise.dropped_scan_probability, lost[1] >= noise.dropped_tick_probability
-    return Samples(tick_s, sweep_s, ranges, latched_s, positions, round_s, readings, has_scan, is_recorded)
+    return Samples(scanner, tick_s, sweep_s, ranges, latched_s, positions, round_s, readings, has_scan, is_recorded)
 
 
 def stamps_of(start_ns: int, time_s: Array) -> Stamps:
@@ -96,7 +98,14 @@ def write_recording(
             newest = {"laser/primary": int(newest_sweep_ns[k]), "encoders": latched, "rfid": int(round_ns[k])}
             sent = [(topics.TICK, tick_message(k, now_ns, begun_ns, newest), begun_ns, k)]
             if samples.has_scan[k]:
-                sent.append((topics.PRIMARY_SCAN, scan_message(sweep, samples.ranges[k]), sweep, int(scan_number[k])))
+                sent.append(
+                    (
+                        topics.PRIMARY_SCAN,
+                        scan_message(sweep, samples.ranges[k], samples.scanner),
+                        sweep,
+                        int(scan_number[k]),
+                    )
+                )
             sent.append((topics.JOINT_STATES, joint_message(latched, names, samples.positions[k]), latched, k))
             sent.append((topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns, k))
             for topic, message, stamp_ns, sequence in sent:
@@ -117,16 +126,17 @@ def tick_message(index: int, scheduled_ns: int, begun_ns: int, newest_ns: dict[s
     )
 
 
-def scan_message(stamp_ns: int, ranges: NDArray[np.float32]) -> object:
+def scan_message(stamp_ns: int, ranges: NDArray[np.float32], scanner: Scanner) -> object:
+    angles = sensors.beam_angles(scanner)
     return messages.LaserScan(
         header=messages.header(stamp_ns, "laser_primary"),
-        angle_min=float(sensors.BEAM_ANGLES[0]),
-        angle_max=float(sensors.BEAM_ANGLES[-1]),
-        angle_increment=float(np.radians(0.5)),
-        time_increment=sensors.BEAM_PERIOD_S,
+        angle_min=float(angles[0]),
+        angle_max=float(angles[-1]),
+        angle_increment=float(np.radians(scanner.increment_deg)),
+        time_increment=sensors.beam_period_s(scanner),
         scan_time=sensors.SWEEP_PERIOD_S,
         range_min=0.016,
-        range_max=sensors.LONGEST_RANGE_M,
+        range_max=scanner.range_m,
         ranges=ranges,
         intensities=np.empty(0, dtype=np.float32),
     )

@@ -16,16 +16,11 @@ from hw_profiles.profile import Encoder, Mount, Profile
 from processing.geometry import compose
 from processing.simulation.drive import Drive
 from processing.simulation.raycast import SegmentGrid, cast
-from processing.simulation.world import Noise, Tag
+from processing.simulation.world import Noise, Scanner, Tag
 
 Array = NDArray[np.float64]
-BEAMS = 541  # LMS111 at 50 Hz: 270°, 0.5°
-BEAM_ANGLES = np.radians(np.linspace(-135.0, 135.0, BEAMS))
-SWEEP_PERIOD_S = 0.02
-BEAM_PERIOD_S = SWEEP_PERIOD_S / 720  # the mirror turns 360° a sweep
-SWEEP_S = (BEAMS - 1) * BEAM_PERIOD_S
+SWEEP_PERIOD_S = 0.02  # LMS111 at 50 Hz
 TRANSFER_S = 0.0035  # from the last beam to the host, as measured on a device
-LONGEST_RANGE_M = 20.0
 ENCODER_LATENCY_S = 0.012  # from latching the positions to the end of their transfer
 ROUND_PERIOD_S = 0.04
 CHUNK_SWEEPS = 500
@@ -41,30 +36,48 @@ class TagReading:
     count: int
 
 
-def sweep_times(tick_s: Array, phase_s: float) -> Array:
+def beam_angles(scanner: Scanner) -> Array:
+    """Bearings (beams,) in the scanner's frame, ascending."""
+    half_deg = scanner.field_of_view_deg / 2
+    return np.asarray(np.radians(np.linspace(-half_deg, half_deg, scanner.beams)))
+
+
+def beam_period_s(scanner: Scanner) -> float:
+    """From a beam to the next: the mirror turns 360° a sweep."""
+    return SWEEP_PERIOD_S / (360 / scanner.increment_deg)
+
+
+def sweep_times(tick_s: Array, phase_s: float, scanner: Scanner) -> Array:
     """First-ray times (n,) of the newest sweeps that the host has whole at the ticks (n,)."""
-    sweep = np.floor((tick_s - phase_s - SWEEP_S - TRANSFER_S) / SWEEP_PERIOD_S)
+    sweep_s = (scanner.beams - 1) * beam_period_s(scanner)
+    sweep = np.floor((tick_s - phase_s - sweep_s - TRANSFER_S) / SWEEP_PERIOD_S)
     return np.asarray(phase_s + sweep * SWEEP_PERIOD_S)
 
 
 def simulate_sweeps(
-    drive: Drive, grid: SegmentGrid, mount: Mount, start_s: Array, range_noise_m: float, generator: np.random.Generator
+    drive: Drive,
+    grid: SegmentGrid,
+    scanner: Scanner,
+    mount: Mount,
+    start_s: Array,
+    range_noise_m: float,
+    generator: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Ranges (n, 541) in metres of sweeps that begin at `start_s` (n,), in whole millimetres; +inf beyond 20 m.
+    """Ranges (n, beams) in metres of sweeps that begin at `start_s` (n,), in whole millimetres; +inf beyond its range.
 
     Each beam leaves from where the laser is at its own time, so a sweep of a moving vehicle is distorted as a real one.
     """
-    ranges = np.empty((len(start_s), BEAMS), dtype=np.float32)
+    ranges = np.empty((len(start_s), scanner.beams), dtype=np.float32)
+    since_first_s, bearings = beam_period_s(scanner) * np.arange(scanner.beams), beam_angles(scanner)
     mounted = np.array([mount.x_m, mount.y_m, np.radians(mount.yaw_deg)])
     for first in range(0, len(start_s), CHUNK_SWEEPS):
         chunk = slice(first, first + CHUNK_SWEEPS)
-        beam_s = start_s[chunk, None] + BEAM_PERIOD_S * np.arange(BEAMS)
-        laser = compose(drive.poses_at(beam_s), mounted)
-        angles = laser[..., 2] + BEAM_ANGLES
-        distances = cast(grid, laser[..., :2].reshape(-1, 2), angles.ravel(), LONGEST_RANGE_M).reshape(angles.shape)
+        laser = compose(drive.poses_at(start_s[chunk, None] + since_first_s), mounted)
+        angles = laser[..., 2] + bearings
+        distances = cast(grid, laser[..., :2].reshape(-1, 2), angles.ravel(), scanner.range_m).reshape(angles.shape)
         distances += generator.normal(0.0, range_noise_m, distances.shape)
         millimetres = np.maximum(np.round(distances * 1000), 1.0)
-        ranges[chunk] = np.where(distances <= LONGEST_RANGE_M, millimetres / 1000, np.inf)
+        ranges[chunk] = np.where(distances <= scanner.range_m, millimetres / 1000, np.inf)
     return ranges
 
 

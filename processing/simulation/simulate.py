@@ -97,7 +97,7 @@ def simulate(
             tags = [tag for tag in world.tags if run.name not in tag.unread_by]
             places = np.array([world.point(tag.at) for tag in tags]).reshape(-1, 2)
             generators = {stream: _generator(seed, run.name, stream) for stream in STREAMS}
-            samples = sample_drive(drive, grid, profile, tags, places, world.noise, generators)
+            samples = sample_drive(drive, grid, profile, tags, places, world.scanner, world.noise, generators)
             boot_id = uuid.uuid5(uuid.NAMESPACE_OID, f"{run_id} {seed}")
             write_recording(folder / f"{run_id}.mcap", samples, profile, profile_toml, start_ns, boot_id)
             write_truth(folder / f"{run_id}.tum", drive, samples, start_ns)

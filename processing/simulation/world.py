@@ -8,6 +8,7 @@ In: a small TOML. Out: a `World`. Lengths in metres, coordinates as [x, y] in th
     [walls]                        roughness of the rock; 0 is a smooth tunnel
     [[tags]]                       RFID tags, each read within a range
     [[runs]]                       drives from waypoint to waypoint; between two places of one drift the way follows it
+    [scanner]                      beams, field of view and range of the laser, where it is no LMS111
     [noise]                        what the sensors get wrong; `profile` names what they are and how they are mounted
 """
 
@@ -89,6 +90,18 @@ class Run(Record, frozen=True):
     stops_s: dict[str, Pause] = field(default_factory=dict)  # standing still at each passage of a place
 
 
+class Scanner(Record, frozen=True):
+    """The laser; an LMS111 at 50 Hz, unless another is named."""
+
+    beams: Annotated[int, Meta(ge=3, le=10_000)] = 541
+    field_of_view_deg: Annotated[float, Meta(gt=0.0, le=360.0)] = 270.0
+    range_m: Annotated[float, Meta(ge=1.0, le=200.0)] = 20.0
+
+    @property
+    def increment_deg(self) -> float:
+        return self.field_of_view_deg / (self.beams - 1)
+
+
 class Noise(Record, frozen=True):
     """What the sensors get wrong. Systematic errors: true = nominal × (1 + error)."""
 
@@ -115,6 +128,7 @@ class World(Record, frozen=True):
     pillars: list[Pillar] = field(default_factory=list)
     tags: list[Tag] = field(default_factory=list)
     walls: Walls = Walls()
+    scanner: Scanner = Scanner()
     driving: Driving = Driving()
     noise: Noise = Noise()
 

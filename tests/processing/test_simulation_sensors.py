@@ -11,7 +11,7 @@ from processing.simulation import sensors
 from processing.simulation.drive import Drive
 from processing.simulation.raycast import build_grid
 from processing.simulation.walls import wall_segments
-from processing.simulation.world import Noise, Tag
+from processing.simulation.world import Noise, Scanner, Tag
 
 Array = NDArray[np.float64]
 QUIET = Noise(range_m=0.0)
@@ -36,7 +36,7 @@ def circle_drive(length_m: float, curvature: float, speed_m_s: float) -> Drive:
 
 def room_sweeps(drive: Drive, mount: Mount, start_s: Array, noise_m: float = 0.0) -> NDArray[np.float32]:
     grid = build_grid(wall_segments(shapely.box(-10, -2, 12, 3)))
-    return sensors.simulate_sweeps(drive, grid, mount, start_s, noise_m, rng())
+    return sensors.simulate_sweeps(drive, grid, Scanner(), mount, start_s, noise_m, rng())
 
 
 def test_ranges_of_a_standing_laser_are_the_room() -> None:
@@ -71,17 +71,30 @@ def test_ranges_are_noisy_as_asked_and_end_at_twenty_metres() -> None:
     assert np.std(ranges[:, 270]) == pytest.approx(0.012, rel=0.15)
     assert np.mean(ranges[:, 270]) == pytest.approx(12.0, abs=0.003)
     hall = build_grid(wall_segments(shapely.box(-30, -2, 19.995, 3)))
-    far = sensors.simulate_sweeps(standing, hall, Mount(), np.full(300, -1.0), 0.012, rng())
+    far = sensors.simulate_sweeps(standing, hall, Scanner(), Mount(), np.full(300, -1.0), 0.012, rng())
     assert 30 < np.sum(np.isposinf(far[:, 270])) < 200  # noise carries some beyond the end
     assert np.max(far[np.isfinite(far)]) <= 20.0
-    back = sensors.simulate_sweeps(standing, hall, Mount(yaw_deg=180.0), np.array([-1.0]), 0.012, rng())
+    back = sensors.simulate_sweeps(standing, hall, Scanner(), Mount(yaw_deg=180.0), np.array([-1.0]), 0.012, rng())
     assert np.isposinf(back[0, 270])
+
+
+def test_another_scanner_sees_as_many_beams_as_wide_and_as_far_as_it_says() -> None:
+    scanner = Scanner(beams=181, field_of_view_deg=180.0, range_m=11.0)
+    room = build_grid(wall_segments(shapely.box(-10, -2, 12, 3)))
+    ranges = sensors.simulate_sweeps(circle_drive(1.0, 0.0, 1.0), room, scanner, Mount(), np.array([-1.0]), 0.0, rng())[
+        0
+    ]
+    assert len(ranges) == 181
+    assert (ranges[0], ranges[180]) == pytest.approx((2.0, 3.0), abs=6e-4)  # to the right, to the left
+    assert np.isposinf(ranges[90])  # the wall is 12 m ahead
+    age = 0.0 - sensors.sweep_times(np.zeros(1), 0.0, scanner)
+    assert age >= 0.010 + sensors.TRANSFER_S - 1e-9  # half a turn of the mirror
 
 
 def test_a_tick_gets_the_newest_sweep_that_was_whole() -> None:
     ticks = np.arange(100) * 0.1
     for phase_s in (0.0, 0.0071, 0.0199):
-        age = ticks - sensors.sweep_times(ticks, phase_s)
+        age = ticks - sensors.sweep_times(ticks, phase_s, Scanner())
         assert np.all(age >= 0.015 + sensors.TRANSFER_S - 1e-9)
         assert np.all(age < 0.015 + sensors.TRANSFER_S + 0.02 + 1e-9)
 
