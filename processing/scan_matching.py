@@ -21,13 +21,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.scan_match import ScanMatch
-from processing.scan_walls import RANGE_NOISE_M, Scan
+from processing.scan_walls import BEARING_RAD, FUSED, RANGE_NOISE_M, Scan, bearing
 
 Array = NDArray[np.float64]
 
 UNSEEN_VARIANCE = 1e4  # m², rad²: the match says nothing about this direction
 PRETENCE = 3.0  # information less than so many times what noisy normals pretend is none
 SETTLED = 0.05  # standard deviations: steps smaller than this do not matter
+MOST_RESTLESS = 0.5  # where points change their partners for ever, steps smaller than this end it
 MIN_MATCHED = 10  # points, and
 MIN_OVERLAP = 0.08  # of the current scan's: fewer in common are no match
 COARSE = 3  # while pairs may be further apart than the next, every third point says enough
@@ -39,7 +40,7 @@ MODEL_NOISE_M = 0.001  # what matching on other points of a rough wall leaves, h
 Matcher = Callable[[Scan, Scan, Array], ScanMatch]  # reference, current, first guess (3,)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _nearest(
     points: Array,
     normals: Array,
@@ -99,7 +100,7 @@ def _eigen(matrix: Array, values: Array, vectors: Array) -> None:
         values[k] = a[k, k]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _gauss_newton(
     ref_points: Array,
     ref_normals: Array,
@@ -120,12 +121,13 @@ def _gauss_newton(
     Returns: points on walls, those that the reference must have seen, those that matched, their rms distance to the
     line [m], converged.
     """
-    beams = ref_points.shape[0]
+    beams, bent = ref_points.shape[0], bent + BEARING_RAD
     on_walls = np.flatnonzero(np.isfinite(normals[:, 0]))
     motion[:] = guess
     converged = False
     valid, visible, matched = len(on_walls), 0, 0
     sum_squares = sum_weights = 0.0
+    restless_before = math.inf
     step, values, vectors = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     lever = np.array(
         [1.0, 1.0, 1.0 / LEVER_M]
@@ -144,10 +146,10 @@ def _gauss_newton(
             x, y = rx + motion[0], ry + motion[1]
             nx, ny = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
             distance = math.sqrt(x * x + y * y)
-            bearing = math.atan2(y, x) - angle_min
-            if bearing < 0:
-                bearing += 2 * math.pi
-            middle = int(bearing / increment + 0.5)
+            seen_at = bearing(x, y) - angle_min
+            if seen_at < 0:
+                seen_at += 2 * math.pi
+            middle = int(seen_at / increment + 0.5)
             best = _nearest(ref_points, ref_normals, increment, bent, middle, (x, y, nx, ny, distance), reach)
             if best < 0:  # gone, or never in the reference's sight: beside its field of view, or behind its walls?
                 if (
@@ -202,11 +204,13 @@ def _gauss_newton(
                 for b in range(3):
                     covariance[a, b] += variance * v[a] * v[b] * scale[a, b]
         motion -= step
-        if reach <= CLOSEST_M and restless < SETTLED:
+        if reach > CLOSEST_M:
+            continue
+        grows_calmer = restless < restless_before and iteration < max_iterations - 1
+        if restless < SETTLED or (restless < MOST_RESTLESS and not grows_calmer):
             converged = True
             break
-        if iteration == max_iterations - 1:  # points that change their partners for ever, by less than it matters
-            converged = restless < 10 * SETTLED
+        restless_before = restless
     motion[2] = math.atan2(math.sin(motion[2]), math.cos(motion[2]))
     rms = math.sqrt(sum_squares / sum_weights) if matched else math.inf
     return valid, visible, matched, rms, converged

@@ -21,6 +21,8 @@ MAX_NEIGHBOURS = 12
 SMOOTH_M = 2.0  # a wall this far straight, to as much as noise lets one see, is smooth
 CHANCE = 2.0  # standard deviations by which its residuals may exceed the noise
 GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ see no wall, or see it at less than 10°
+BEARING_RAD = 2.5e-4  # how far off `bearing` may be
+FUSED = {"contract", "nsz", "arcp"}  # what compilers may do to sums and quotients; NaN stays NaN
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,30 +37,63 @@ class Scan:
     bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
 
 
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
+def bearing(x: float, y: float) -> float:
+    """The bearing of a point, a polynomial in place of the arctangent: to know where to look, BEARING_RAD will do."""
+    ax, ay = abs(x), abs(y)
+    larger = max(ax, ay)
+    t = min(ax, ay) / larger if larger > 0 else 0.0
+    q = t * t
+    angle = ((-0.0464964749 * q + 0.15931422) * q - 0.327622764) * q * t + t
+    if ay > ax:
+        angle = math.pi / 2 - angle
+    if x < 0:
+        angle = math.pi - angle
+    return -angle if y < 0 else angle
+
+
 @njit(cache=True)
-def _stretches(points: Array, joined: NDArray[np.bool_]) -> tuple[Array, Ints]:
+def _stretches(points: Array, joined: NDArray[np.bool_]) -> tuple[Array, Ints, Ints]:
     """Sums (B + 1, 5) of x, y, x², xy, y² over all points before each; and for each point the first and the last (B, 2)
-    of those in a row with it that lie within SMOOTH_M.
+    of those in a row with it, and of those in a row that lie within SMOOTH_M.
     """
     count = points.shape[0]
-    sums, ends = np.zeros((count + 1, 5)), np.zeros((count, 2), np.int64)
+    sums, rows, ends = np.zeros((count + 1, 5)), np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
     first = last = 0
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        for k, value in enumerate((x, y, x * x, x * y, y * y)):
-            sums[i + 1, k] = sums[i, k] + (value if math.isfinite(x) else 0.0)
+        known = math.isfinite(x)
+        sums[i + 1] = sums[i]
+        if known:
+            sums[i + 1, 0] += x
+            sums[i + 1, 1] += y
+            sums[i + 1, 2] += x * x
+            sums[i + 1, 3] += x * y
+            sums[i + 1, 4] += y * y
         if i > 0 and not joined[i - 1]:
             first = i
+        rows[i, 0] = rows[i - 1, 0] if i > 0 and joined[i - 1] else i
         while first < i and (points[first, 0] - x) ** 2 + (points[first, 1] - y) ** 2 > SMOOTH_M * SMOOTH_M:
             first += 1
         last = max(last, i)
         while joined[last] and (points[last + 1, 0] - x) ** 2 + (points[last + 1, 1] - y) ** 2 <= SMOOTH_M * SMOOTH_M:
             last += 1
         ends[i, 0], ends[i, 1] = first, last
-    return sums, ends
+    for i in range(count - 1, -1, -1):
+        rows[i, 1] = rows[i + 1, 1] if joined[i] else i
+    return sums, rows, ends
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
+def _scatter(sums: Array, first: int, last: int) -> tuple[float, float, float]:
+    """xx, xy, yy of the points from `first` to `last` about their mean, times their number."""
+    n = last - first + 1
+    x, y = sums[last + 1, 0] - sums[first, 0], sums[last + 1, 1] - sums[first, 1]
+    xx, xy = sums[last + 1, 2] - sums[first, 2], sums[last + 1, 3] - sums[first, 3]
+    return xx - x * x / n, xy - x * y / n, sums[last + 1, 4] - sums[first, 4] - y * y / n
+
+
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array, variances: Array) -> float:
     """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are.
 
@@ -67,37 +102,24 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
     count, bent = points.shape[0], 0.0
     for i in range(count):
         if math.isfinite(points[i, 0]):
-            off = math.atan2(points[i, 1], points[i, 0]) - (angle_min + i * increment)
+            off = bearing(points[i, 0], points[i, 1]) - (angle_min + i * increment)
             bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
     joined = np.zeros(count, np.bool_)  # with the next beam: do the two see one wall?
     for i in range(count - 1):
         dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
         reach = math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
         joined[i] = math.sqrt(dx * dx + dy * dy) < max(0.15, GRAZING * increment * reach)  # NaN compares false
-    sums, ends = _stretches(points, joined)
+    sums, rows, ends = _stretches(points, joined)
     for i in range(count):
         normals[i, 0] = normals[i, 1] = np.nan
         variances[i, 0] = variances[i, 1] = np.nan
         if i == 0 or i == count - 1 or not (joined[i - 1] and joined[i]):
             continue
-        # Grow to both sides, a beam at a time; the moments are those about point i.
-        x0, y0 = points[i, 0], points[i, 1]
+        # Grow to both sides, a beam at a time.
+        leftmost, rightmost = max(rows[i, 0], i - MAX_NEIGHBOURS), min(rows[i, 1], i + MAX_NEIGHBOURS)
         low = high = i
-        grow_low = grow_high = True
-        sx = sy = sxx = sxy = syy = 0.0
-        while (grow_low or grow_high) and high - low < 2 * MAX_NEIGHBOURS:
-            if grow_low:
-                grow_low = low > 0 and joined[low - 1] and i - low < MAX_NEIGHBOURS
-                if grow_low:
-                    low -= 1
-                    dx, dy = points[low, 0] - x0, points[low, 1] - y0
-                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
-            if grow_high:
-                grow_high = high < count - 1 and joined[high] and high - i < MAX_NEIGHBOURS
-                if grow_high:
-                    high += 1
-                    dx, dy = points[high, 0] - x0, points[high, 1] - y0
-                    sx, sy, sxx, sxy, syy = sx + dx, sy + dy, sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+        while low > leftmost or high < rightmost:
+            low, high = max(low - 1, leftmost), min(high + 1, rightmost)
             if high - low >= 4:
                 dx, dy = points[high, 0] - points[low, 0], points[high, 1] - points[low, 1]
                 if dx * dx + dy * dy > WALL_LENGTH_M * WALL_LENGTH_M:
@@ -105,16 +127,13 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
         n = high - low + 1
         if n < 4:
             continue
-        sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+        sxx, sxy, syy = _scatter(sums, low, high)
         # A smooth wall is known better from a longer stretch of it: to both sides, or, at its ends, to one.
         for a, b in ((ends[i, 0], ends[i, 1]), (ends[i, 0], i + 1), (i - 1, ends[i, 1])):
             dx, dy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             m = b - a + 1
             if m > n and dx * dx + dy * dy > SMOOTH_M * SMOOTH_M:
-                tx, ty = sums[b + 1, 0] - sums[a, 0], sums[b + 1, 1] - sums[a, 1]
-                txx = sums[b + 1, 2] - sums[a, 2] - tx * tx / m
-                txy = sums[b + 1, 3] - sums[a, 3] - tx * ty / m
-                tyy = sums[b + 1, 4] - sums[a, 4] - ty * ty / m
+                txx, txy, tyy = _scatter(sums, a, b)
                 rest = 0.5 * (txx + tyy) - math.sqrt(0.25 * (txx - tyy) ** 2 + txy * txy)
                 if rest < RANGE_NOISE_M**2 * (m - 2 + CHANCE * math.sqrt(2.0 * (m - 2))):
                     n, sxx, sxy, syy = m, txx, txy, tyy
@@ -129,13 +148,13 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
         wx, wy = (root + half, sxy) if half > 0 else (sxy, root - half)
         length = math.sqrt(wx * wx + wy * wy)
         nx, ny = -wy / length, wx / length
-        if nx * x0 + ny * y0 > 0:
+        if nx * points[i, 0] + ny * points[i, 1] > 0:
             nx, ny = -nx, -ny
         noise = max(across / (n - 2), RANGE_NOISE_M * RANGE_NOISE_M)
         normals[i, 0], normals[i, 1] = nx, ny
         variances[i, 0] = noise
         variances[i, 1] = noise / along
-    return bent
+    return bent + BEARING_RAD
 
 
 def prepare_scan(points: Array, angle_min: float, angle_increment: float) -> Scan:
