@@ -26,9 +26,11 @@ from numpy.typing import NDArray
 
 from processing.geometry import Array, inverse, transform
 
-HIT = np.float32(0.85)  # log-odds of p = 0.7, of a cell that a beam ends in
-MISS = np.float32(-0.4)  # p = 0.4, of a cell that beams only pass
-LOWEST, HIGHEST = np.float32(-2.0), np.float32(3.5)  # p = 0.12 … 0.97: beyond, a changed drift would never show
+STEP = np.float32(0.05)  # log-odds are whole numbers of it, so that one fits into a byte
+HIT = 17  # steps: p = 0.7, of a cell that a beam ends in
+MISS = -8  # p = 0.4, of a cell that beams only pass
+LOWEST, HIGHEST = -40, 70  # p = 0.12 … 0.97: beyond, a changed drift would never show
+BITS = np.int64(24)  # behind the point
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,24 +57,25 @@ class Grid:
     def window(self) -> Window:
         return Window(self.log_odds.shape, self.resolution_m, self.origin)
 
-    def load(self) -> "Grid":
-        return self
+    def cells(self) -> tuple[NDArray[np.float32], np.float32]:
+        """The cells, and what one of them is a multiple of."""
+        return self.log_odds, np.float32(1)
 
 
 @dataclass(frozen=True, slots=True)
 class StoredGrid:
-    """A grid in a file; of a loaded one, only what is looked at is read."""
+    """A grid of whole steps in a file; of its cells, only what is looked at is read."""
 
     path: Path
     window: Window
 
-    def load(self) -> Grid:
-        return Grid(np.load(self.path, mmap_mode="c"), self.window.resolution_m, self.window.origin)
+    def cells(self) -> tuple[NDArray[np.int8], np.float32]:
+        return np.load(self.path, mmap_mode="c"), STEP
 
 
 def store_grid(grid: Grid, path: Path) -> StoredGrid:
-    """Raises: OSError: the disk is full."""
-    np.save(path, grid.log_odds)
+    """Of a grid as `build_grid` makes it. Raises: OSError: the disk is full."""
+    np.save(path, np.rint(grid.log_odds / STEP).astype(np.int8))
     return StoredGrid(path, grid.window)
 
 
@@ -99,47 +102,69 @@ def build_grid(
     ends, starts = ends / resolution_m, laser_poses[:, :2] / resolution_m
     low = np.floor(np.minimum(ends.min(axis=(0, 2)), starts.min(axis=0)))
     width, height = (np.floor(np.maximum(ends.max(axis=(0, 2)), starts.max(axis=0))) - low).astype(int) + 1
-    log_odds = np.zeros((height, width), dtype=np.float32)
-    _trace(log_odds, starts - low, ends - low[:, None], reach > 0, (ranges > 0) & (ranges <= max_range_m))
+    state = np.full((height, width), -LOWEST, dtype=np.int32)
+    _trace(state, starts - low, ends - low[:, None], reach > 0, (ranges > 0) & (ranges <= max_range_m))
+    log_odds = ((state & 255) + LOWEST).astype(np.float32) * STEP
     return Grid(log_odds, resolution_m, low * resolution_m)
 
 
 @numba.njit(cache=True)
 def _trace(
-    log_odds: NDArray[np.float32],  # (H, W), changed in place
+    state: NDArray[np.int32],  # (H, W), in place: the steps of a cell above LOWEST + 256 · the last scan that spoke of it
     starts: Array,  # (n, 2) of the laser, in cells
     ends: Array,  # (n, 2, B) of the beams, in cells
     valid: NDArray[np.bool_],  # (n, B)
     hit: NDArray[np.bool_],  # (n, B) the beam ends on something
 ) -> None:
-    # flat unsigned indices, and the steps in fixed point: a third faster than two signed ones of floats
-    cells, columns = log_odds.reshape(-1), np.int64(log_odds.shape[1])
-    touched = np.full(cells.size, -1, dtype=np.int32)  # the last scan that spoke of the cell
-    bits, one = np.int64(24), np.int64(1) << np.int64(24)
+    # flat unsigned indices, and the paces in fixed point: a third faster than two signed ones of floats
+    cells, columns, beams = state.reshape(-1), np.int64(state.shape[1]), ends.shape[2]
+    one = np.int64(1) << BITS
+    paces = np.zeros((beams, 2), np.int64)  # one cell at a time along the longer side
+    counts = np.zeros(beams, np.int64)  # of them
     for scan in range(len(starts)):
-        for beam in range(ends.shape[2]):
+        x0, y0 = starts[scan]
+        spoken = np.int32((scan + 1) << 8)
+        for beam in range(beams):
+            dx, dy = ends[scan, 0, beam] - x0, ends[scan, 1, beam] - y0
+            length = max(abs(dx), abs(dy))
+            counts[beam] = np.int64(length) if valid[scan, beam] else 0
+            if counts[beam] > 0:
+                paces[beam, 0], paces[beam, 1] = np.int64(dx / length * one), np.int64(dy / length * one)
             if hit[scan, beam]:
                 cell = np.uint64(np.int64(ends[scan, 1, beam]) * columns + np.int64(ends[scan, 0, beam]))
-                if touched[cell] != scan:
-                    touched[cell] = scan
-                    cells[cell] = min(cells[cell] + HIT, HIGHEST)
-        x0, y0 = starts[scan]
-        for beam in range(ends.shape[2]):
-            if not valid[scan, beam]:
+                if cells[cell] < spoken:
+                    cells[cell] = spoken | min((cells[cell] & 255) + HIT, HIGHEST - LOWEST)
+        for beam in range(beams):
+            if counts[beam] == 0:
                 continue
-            dx, dy = ends[scan, 0, beam] - x0, ends[scan, 1, beam] - y0
-            steps = max(abs(dx), abs(dy))  # one cell a step along the longer side
-            if steps < 1.0:
-                continue
-            x, y = np.int64(x0 * one), np.int64(y0 * one)
-            step_x, step_y = np.int64(dx / steps * one), np.int64(dy / steps * one)
-            for _ in range(int(steps)):
-                cell = np.uint64((y >> bits) * columns + (x >> bits))
-                if touched[cell] != scan:
-                    touched[cell] = scan
-                    cells[cell] = max(cells[cell] + MISS, LOWEST)
-                x += step_x
-                y += step_y
+            first = _passed(paces, counts, beam)
+            pace_x, pace_y = paces[beam]
+            x, y = np.int64(x0 * one) + first * pace_x, np.int64(y0 * one) + first * pace_y
+            for _ in range(first, counts[beam]):
+                cell = np.uint64((y >> BITS) * columns + (x >> BITS))
+                if cells[cell] < spoken:
+                    cells[cell] = spoken | max((cells[cell] & 255) + MISS, 0)
+                x += pace_x
+                y += pace_y
+
+
+@numba.njit(cache=True)
+def _passed(paces: NDArray[np.int64], counts: NDArray[np.int64], beam: int) -> int:
+    """How many of the first cells of a beam others pass for it: near the laser, beams lie closer than cells.
+
+    Of two beams to both sides, less than a cell apart, one passes the cell between; beam 4 k + 2 has its neighbours
+    among those that can be divided by 4, and so on.
+    """
+    stride = beam & -beam
+    a, b = beam - stride, beam + stride
+    if stride == 0 or b >= len(counts) or counts[a] == 0 or counts[b] == 0:
+        return 0
+    one = np.int64(1) << BITS
+    for along in range(2):
+        if abs(paces[beam, along]) == one and paces[a, along] == paces[beam, along] == paces[b, along]:
+            apart = abs(paces[a, 1 - along] - paces[b, 1 - along])
+            return min(counts[a], counts[b], counts[beam], one // max(apart, 1))
+    return 0
 
 
 def stitched_window(grids: Sequence[Grid | StoredGrid], placements: Array) -> Window:
@@ -183,13 +208,15 @@ def add_grid(whole: Grid, part: Grid | StoredGrid, pose: Array) -> None:
     back = inverse(pose)
     start = (transform(back, whole.origin + resolution_m / 2) - part.window.origin) / resolution_m - 0.5
     turn = np.array([np.cos(back[2]), np.sin(back[2])])
-    _resample(whole.log_odds, part.load().log_odds, start, turn, first, last)
+    cells, unit = part.cells()
+    _resample(whole.log_odds, cells, unit, start, turn, first, last)
 
 
 @numba.njit(cache=True)
 def _resample(
     whole: NDArray[np.float32],  # (H, W), changed in place
-    part: NDArray[np.float32],  # (h, w)
+    part: NDArray[np.float32] | NDArray[np.int8],  # (h, w)
+    unit: np.float32,  # of which the part is a multiple
     start: Array,  # (2,) centre of whole[0, 0], counted in cells from the centre of part[0, 0]
     turn: Array,  # (2,) cosine, sine: one column further in the whole
     first: NDArray[np.int64],  # (2,) column, row of the whole
@@ -229,7 +256,7 @@ def _resample(
                 for j, weight_x in ((left, 1.0 - u), (left + 1, u)):
                     if 0 <= i < height and 0 <= j < width:
                         value += weight_x * weight_y * part[i, j]
-            whole[row, column] += np.float32(value)
+            whole[row, column] += np.float32(value * unit)
 
 
 def _corners(window: Window, pose: Array) -> Array:

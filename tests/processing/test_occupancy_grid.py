@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from processing.geometry import compose, inverse, transform
-from processing.occupancy_grid import HIGHEST, HIT, LOWEST, MISS, Grid, add_grid, build_grid, stitch
+from processing.occupancy_grid import HIGHEST, HIT, LOWEST, MISS, STEP, Grid, add_grid, build_grid, stitch
 
 CELL = 0.05
 ANGLES = np.radians(np.linspace(-135, 135, 541))
@@ -88,14 +88,14 @@ def test_hits_win_within_a_scan_and_each_cell_is_told_once() -> None:
     # three beams end in one cell, a fourth passes it to a far wall; ten more pass the same free cells
     angles = np.array([0.0, 0.001, 0.002, 0.003])
     grid = build_grid(np.zeros((1, 3)), np.array([[1.02, 1.02, 1.02, 3.02]]), angles)
-    assert_allclose(value_at(grid, np.array([[1.02, 0.001], [0.5, 0.001]])), [HIT, MISS])
-    assert_allclose(grid.log_odds.max(), HIT)
+    assert_allclose(value_at(grid, np.array([[1.02, 0.001], [0.5, 0.001]])), [HIT * STEP, MISS * STEP])
+    assert_allclose(grid.log_odds.max(), HIT * STEP)
 
 
 def test_saturation(drive) -> None:
     pose = np.zeros((200, 3))
     grid = build_grid(pose, np.repeat(scan_room(pose[0])[None], 200, axis=0), ANGLES)
-    assert_allclose([grid.log_odds.min(), grid.log_odds.max()], [LOWEST, HIGHEST])
+    assert_allclose([grid.log_odds.min(), grid.log_odds.max()], [LOWEST * STEP, HIGHEST * STEP])
 
 
 def test_beams_without_return_invalid_and_far_ones() -> None:
