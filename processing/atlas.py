@@ -10,8 +10,9 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas_schema import check_document
-from processing.map_files import MapImage, Overlay, StoredImage, write_map
+from processing.map_files import MapImage, Overlay, StoredImage, write_image, write_picture
 from processing.tum import write_tum
+from processing.workers import Workers
 
 Array = NDArray[np.float64]
 
@@ -47,7 +49,7 @@ def refuse_existing(path: Path) -> None:
         raise BadInputError(f"{path.parent}: no permission to write here")
 
 
-def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage) -> None:
+def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage, work: Workers) -> None:
     """Write the folder beside its place, and move it there once it is whole. The files of the edges are moved into it.
 
     Raises:
@@ -59,7 +61,7 @@ def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage
         part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         try:
             part.chmod(0o755)
-            _write_files(part, atlas, edges, image)
+            _write_files(part, atlas, edges, image, work)
             part.rename(path)
         finally:
             shutil.rmtree(part, ignore_errors=True)  # after the renaming, nothing is there
@@ -67,16 +69,25 @@ def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage
         raise RTLogError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _write_files(folder: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage) -> None:
+def _write_files(
+    folder: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage, work: Workers
+) -> None:
     (folder / "edges").mkdir()
     (folder / "trajectories").mkdir()
     for edge in edges:
         shutil.move(edge, folder / "edges" / edge.name)
-    for run_id, (stamps_ns, poses) in atlas.trajectories.items():
-        write_tum(folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
-    write_map(folder, image, _overlay(atlas))
+    writing: list[Callable[[], None]] = [
+        partial(write_tum, folder / "trajectories" / f"{run_id}.tum", stamps_ns, poses)
+        for run_id, (stamps_ns, poses) in atlas.trajectories.items()
+    ]
+    writing += [partial(write_picture, folder, image, _overlay(atlas)), partial(write_image, folder, image)]
+    work.map("files", _call, writing)
     text = json.dumps(atlas.document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "atlas.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _call(function: Callable[[], None]) -> None:
+    function()
 
 
 def read_document(path: Path) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """Calibration: by how much the wheels of a run count too little or too much, as far as the laser can tell.
 
-In: a run. Out: the same run with its wheels put right. Real wheels are wrong by a percent or two, always the same
-way: a worn tyre, a wrong radius in the profile. Where the walls are rough, or a crossing comes by, scan matches see
-how far the vehicle really went; what is learnt there is carried into the drifts where the laser sees nothing along
-the way.
+In: a run, and pairs of its scans compared. Out: the same run with its wheels put right. Real wheels are wrong by a
+percent or two, always the same way: a worn tyre, a wrong radius in the profile. Where the walls are rough, or a
+crossing comes by, scan matches see how far the vehicle really went; what is learnt there is carried into the drifts
+where the laser sees nothing along the way.
 
 What they say wrongly about turns is `turn_calibration`'s.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -20,13 +21,15 @@ from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.scan_matching import match_scans
-from processing.sweeps import sweeps_of
+from processing.sweeps import Sweeps, sweeps_of
 from processing.turn_calibration import WheelTurn, fit_turn, put_right
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 STRIDES_M = (2.0, 4.0)  # between two scans that are compared
 MAX_PAIRS = 400  # of each stride
+COMPARED_AT_ONCE = 50
 MAX_TURN_RAD = 0.3  # in a curve, arc and chord differ
 MOST_TURN_RAD = 1.0  # beyond, a scanner sees too little twice
 WHEELS_M = 0.05  # how well the wheels know a few metres, where the walls do not show them
@@ -59,9 +62,8 @@ class Pairs:
     covariances: Array  # (k, 3, 3) of those
 
 
-def calibrate(run: Run) -> tuple[Run, WheelScale]:
+def calibrate(run: Run, pairs: Pairs) -> tuple[Run, WheelScale]:
     """The run with its wheels as the laser sees them; its distances as they were where the laser sees too little."""
-    pairs = measure_pairs(run)
     found = scale_of(pairs)
     if found.sigma > MAX_SIGMA:
         found = replace(found, scale=1.0)
@@ -85,26 +87,53 @@ def _with_noise(profile: Profile, noise_m_per_sqrt_m: float) -> Profile:
     return msgspec.structs.replace(profile, vehicle=msgspec.structs.replace(profile.vehicle, odometry_noise=noise))
 
 
-def measure_pairs(run: Run) -> Pairs:
-    """What the wheels count over a few metres, and what scan matches see of it."""
-    odometry, mount = odometry_at_scans(run), mount_pose(run)
-    sweeps = sweeps_of(run.scans, odometry, mount)
+@dataclass(frozen=True, slots=True)
+class Strides:
+    """Pairs of scans to compare, k of them; a stretch of the run's sweeps is all that is needed for it."""
+
+    sweeps: Sweeps
+    ends: Ints  # (k, 2) sweeps of the stretch
+    counted: Array  # (k, 3) motions of the vehicle by its wheels
+
+
+def cut_strides(run: Run) -> list[Strides]:
+    """All pairs that are worth comparing, a stretch after the other."""
+    odometry = odometry_at_scans(run)
+    sweeps = sweeps_of(run.scans, odometry, mount_pose(run))
     driven = accumulate(np.zeros(3), odometry.deltas)
     way = np.append(0.0, np.cumsum(np.hypot(*odometry.deltas[:, :2].T)))
-    counted, seen, covariances = [], [], []
-    for first, last in stride_pairs(way):
-        guess = relative(driven[first], driven[last])
-        if abs(guess[2]) > MOST_TURN_RAD or abs(guess[0]) < 0.5 * (way[last] - way[first]):
-            continue
-        one, other = sweeps.scan(first), sweeps.scan(last)
-        match = match_scans(one, other, compose(inverse(mount), compose(guess, mount)))
+    ends = stride_pairs(way)
+    counted = relative(driven[ends[:, 0]], driven[ends[:, 1]])
+    worth = (np.abs(counted[:, 2]) <= MOST_TURN_RAD) & (np.abs(counted[:, 0]) >= 0.5 * np.diff(way[ends])[:, 0])
+    ends, counted = ends[worth], counted[worth]
+    stretches = []
+    for k in range(0, len(ends), COMPARED_AT_ONCE):
+        some = ends[k : k + COMPARED_AT_ONCE]
+        first, last = int(some.min()), int(some.max())
+        stretches.append(Strides(sweeps.cut(first, last), some - first, counted[k : k + COMPARED_AT_ONCE]))
+    return stretches
+
+
+def compare_strides(strides: Strides) -> Pairs:
+    """What scan matches see of the motions: of those pairs that match."""
+    mount, matched, seen, covariances = strides.sweeps.mount, [], [], []
+    for k, (first, last) in enumerate(strides.ends.tolist()):
+        one, other = strides.sweeps.scan(first), strides.sweeps.scan(last)
+        match = match_scans(one, other, compose(inverse(mount), compose(strides.counted[k], mount)))
         motion, covariance = through_mount(mount, match.motion, match.covariance)
         if match.converged and match.inliers >= MIN_INLIERS:
-            counted.append(guess)
+            matched.append(k)
             seen.append(motion)
             covariances.append(covariance)
+    counted = strides.counted[np.array(matched, np.int64)]
+    return Pairs(counted, np.array(seen).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))
+
+
+def join_pairs(parts: Sequence[Pairs]) -> Pairs:
     return Pairs(
-        np.array(counted).reshape(-1, 3), np.array(seen).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
+        np.concatenate([np.zeros((0, 3)), *(part.counted for part in parts)]),
+        np.concatenate([np.zeros((0, 3)), *(part.seen for part in parts)]),
+        np.concatenate([np.zeros((0, 3, 3)), *(part.covariances for part in parts)]),
     )
 
 
@@ -125,15 +154,15 @@ def turn_of(pairs: Pairs) -> WheelTurn:
     return fit_turn(pairs.counted[:, 2], ahead_m, pairs.counted[:, 2] + change, known[:, 2, 2])
 
 
-def stride_pairs(way: Array) -> list[tuple[int, int]]:
-    """Pairs of scans some metres apart, all along the way travelled (n,)."""
-    pairs: list[tuple[int, int]] = []
+def stride_pairs(way: Array) -> Ints:
+    """Pairs (p, 2) of scans some metres apart, all along the way travelled (n,)."""
+    pairs = [np.zeros((0, 2), np.int64)]
     for stride in STRIDES_M:
         firsts = np.unique(np.searchsorted(way, np.arange(0.0, way[-1] - stride, stride / 2)))
         firsts = firsts[:: max(1, -(-len(firsts) // MAX_PAIRS))]
         lasts = np.searchsorted(way, way[firsts] + stride)
-        pairs += [(int(a), int(b)) for a, b in zip(firsts, lasts, strict=True) if a < b < len(way)]
-    return pairs
+        pairs.append(np.column_stack([firsts, lasts])[(firsts < lasts) & (lasts < len(way))])
+    return np.concatenate(pairs)
 
 
 def fit_scale(counted: Array, seen: Array, variances: Array) -> WheelScale:

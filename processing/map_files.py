@@ -16,7 +16,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hw_profiles.errors import BadInputError
 from processing.geometry import Array
-from processing.occupancy_grid import Grid, StoredGrid, Window, stitch, stitched_window
+from processing.occupancy_grid import Grid, StoredGrid, Window
+from processing.stitching import stitch, stitched_window
 from processing.workers import Workers
 
 Image.MAX_IMAGE_PIXELS = None  # a mine of kilometres is no attack
@@ -124,9 +125,14 @@ def band_rows(width: int) -> int:
 
 
 def write_map(folder: Path, image: MapImage | StoredImage, overlay: Overlay | None = None) -> None:
-    """Write map.pgm, map.yaml and map.png into the folder, which exists; of a map without cells, one unknown pixel."""
-    if 0 in image.shape:
-        image = MapImage(np.full((1, 1), UNKNOWN, dtype=np.uint8), image.resolution_m, image.origin)
+    """Write map.pgm, map.yaml and map.png into the folder, which exists."""
+    write_image(folder, image)
+    write_picture(folder, image, overlay or Overlay())
+
+
+def write_image(folder: Path, image: MapImage | StoredImage) -> None:
+    """Write map.pgm and map.yaml."""
+    image = _not_empty(image)
     (height, width), step = image.shape, band_rows(image.shape[1])
     with (folder / "map.pgm").open("wb") as file:
         file.write(b"P5\n%d %d\n255\n" % (width, height))
@@ -138,7 +144,18 @@ def write_map(folder: Path, image: MapImage | StoredImage, overlay: Overlay | No
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
         encoding="utf-8",
     )
-    draw_map(image, overlay or Overlay()).save(folder / "map.png")
+
+
+def write_picture(folder: Path, image: MapImage | StoredImage, overlay: Overlay) -> None:
+    """Write map.png."""
+    draw_map(image, overlay).save(folder / "map.png")
+
+
+def _not_empty(image: MapImage | StoredImage) -> MapImage | StoredImage:
+    """A map without cells becomes one unknown pixel: programs do not read pictures of nothing."""
+    if 0 in image.shape:
+        return MapImage(np.full((1, 1), UNKNOWN, dtype=np.uint8), image.resolution_m, image.origin)
+    return image
 
 
 def read_map(folder: Path) -> MapImage:
@@ -172,6 +189,7 @@ def read_map(folder: Path) -> MapImage:
 
 def draw_map(image: MapImage | StoredImage, overlay: Overlay) -> Image.Image:
     """The picture: walls dark, free white, unknown grey; trajectories, edges and named nodes over it; a scale bar."""
+    image = _not_empty(image)
     height, width = image.shape
     least, most = PICTURE_PIXELS
     enlarge, shrink = max(1, least // max(height, width)), -(-max(height, width) // most)
@@ -181,7 +199,9 @@ def draw_map(image: MapImage | StoredImage, overlay: Overlay) -> Image.Image:
     colours = np.array([DARK] * 256, dtype=np.uint8)
     colours[OCCUPIED], colours[FREE] = WALL, OPEN
     framed = np.pad(pixels, MARGIN_PIXELS, constant_values=UNKNOWN)
-    picture = Image.fromarray(colours[framed])
+    indexed = Image.fromarray(framed, "P")
+    indexed.putpalette(colours.tobytes())
+    picture = indexed.convert("RGB")
     pixels_per_m = enlarge / shrink / image.resolution_m
     draw = ImageDraw.Draw(picture)
 

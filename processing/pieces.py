@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from processing.edge_map import Path, PieceMap, map_piece
 from processing.geometry import compose
 from processing.graph import Piece, Span
-from processing.occupancy_grid import Grid, build_grid
+from processing.occupancy_grid import Grid, View, build_grid
 from processing.open_loop import OpenLoop
 from processing.registration import path_starts
 from processing.scan_matching import Matcher
@@ -115,13 +115,9 @@ def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:
 
 def draw_piece(given: PieceInput, firsts: Ints, poses: Array, resolution_m: float) -> Grid:
     """The occupancy grid of a piece, in the frame of the key frames' poses (N, 3)."""
-    laser, ranges, angles = [], [], []
+    views = []
     for p, sight in enumerate(given.sights):
-        laser.append(compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), given.mount))
-        measured = sight.sweeps.ranges[sight.rows]
-        points = sight.sweeps.straighten(measured, sight.rows)
-        returned = np.isfinite(points[..., 0])
-        bearings = np.arctan2(points[..., 1], points[..., 0])
-        ranges.append(np.where(returned, np.hypot(points[..., 0], points[..., 1]), measured))
-        angles.append(np.where(returned, bearings, sight.sweeps.angles.astype(np.float32)))
-    return build_grid(np.concatenate(laser), np.concatenate(ranges), np.concatenate(angles), resolution_m)
+        laser = compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), given.mount)
+        ranges = sight.sweeps.ranges[sight.rows]
+        views.append(View(laser, sight.sweeps.straighten(ranges, sight.rows), ranges, sight.sweeps.angles))
+    return build_grid(views, resolution_m)

@@ -1,14 +1,13 @@
 """The whole method in one screen: recordings in, atlas out.
 
-recordings ─ read_log ─ open_loop ─ beacons ─┐
-                                             graph ─ pieces (edge_map) ─ assembly ─ edge_files ─ map_files ─ Atlas
-                                               └─────── tags missed ◄───────┘
+recordings ─ read_runs ─ open_loop ─┐
+                                    graph ─ pieces (edge_map) ─ assembly ─ edge_files ─ map_files ─ Atlas
+                                      └─────── tags missed ◄───────┘
 """
 
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -16,42 +15,38 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hw_profiles.errors import BadInputError, RTLogError
+from hw_profiles.errors import RTLogError
 from hw_profiles.profile import Profile
 from processing.atlas import Atlas, write_atlas
 from processing.atlas_document import assemble_atlas
-from processing.beacons import Pass, find_passes
-from processing.calibration import WheelScale, calibrate
+from processing.beacons import Pass
+from processing.calibration import WheelScale
 from processing.edge_files import edge_of, store_edge
 from processing.edge_placement import Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
 from processing.length_placement import place_by_lengths
 from processing.map_files import StoredImage, stitch_image
-from processing.odometry import Motions, dead_reckon
 from processing.open_loop import (
     OpenLoop,
     cut_segments,
     drive_segment,
     join_segments,
     mount_pose,
-    odometry_at_scans,
 )
 from processing.pieces import PieceInput, SolvedPiece, cut_span, rename, solve_piece
 from processing.polar_matching import match_polar
 from processing.polar_scan import ranges_at
-from processing.read_log import Run, read_log
-from processing.recordings import group_parts
+from processing.read_log import Run
+from processing.read_runs import ReadRun, read_runs
 from processing.remarks import remarks
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, match_scans
 from processing.scan_walls import Scan
-from processing.sweeps import Sweeps, sweeps_of
 from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers
 
 Array = NDArray[np.float64]
 
-MIN_SCANS = 10  # a second
 MAX_REVIEWS = 2  # a pass that was not read may only show when another one has been put in
 
 
@@ -89,17 +84,16 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, outpu
         BadInputError: a recording is unfit, or it cannot be told which run it is, or the output exists already.
         RTLogError: a disk is full, or a process died.
     """
-    parts = group_parts(recordings)
     match = MATCHERS[config.matcher]
     with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as temporary:
         scratch = Path(temporary)
-        take_in = partial(read_run, profile=profile, config=config, scratch=scratch)
-        runs = drive_through(work.map("recordings", take_in, parts), work, match)
+        read = read_runs(recordings, profile, config.method == "landmark", scratch, work)
+        runs = drive_through(read, work, match)
         runs, left_out = leave_out_moved(runs)
         runs, graph, placed = map_network(runs, work, match, config)
         edges, image = draw(runs, placed, config.resolution_m, scratch, work)
         atlas = assemble_atlas(runs, graph, placed, config, remarks(runs, placed), left_out)
-        write_atlas(output, atlas, edges, image)
+        write_atlas(output, atlas, edges, image, work)
     return atlas
 
 
@@ -124,38 +118,16 @@ def map_network(
     return runs, graph, placed
 
 
-@dataclass(frozen=True, slots=True)
-class ReadRun:
-    run: Run
-    wheels: WheelScale
-    odometry: Motions  # n - 1, between scans
-    sweeps: Sweeps  # n
-    passes: list[Pass]
-
-
-def read_run(recording: tuple[Path, ...], profile: Profile | None, config: Config, scratch: Path | None) -> ReadRun:
-    """Read the parts of one recording, put its wheels right and find its passes."""
-    run = read_log(recording[0], profile, recording[1:], scratch)
-    if len(run.scans.times) < MIN_SCANS:
-        raise BadInputError(f"{recording[0]}: {len(run.scans.times)} scans are too few to map")
-    run, wheels = calibrate(run)
-    odometry = odometry_at_scans(run)
-    passes: list[Pass] = []
-    if config.method == "landmark" and len(run.tags.epcs):
-        nearest = np.searchsorted((run.scans.times[1:] + run.scans.times[:-1]) / 2, run.tags.times)
-        passes = find_passes(run.tags.epcs, nearest, dead_reckon(odometry))
-    return ReadRun(run, wheels, odometry, sweeps_of(run.scans, odometry, mount_pose(run)), passes)
-
-
 def drive_through(runs: list[ReadRun], work: Workers, match: Matcher) -> list[DrivenRun]:
     """Estimate the runs open loop; every pass becomes a key frame."""
-    cut = [cut_segments(of.sweeps, of.odometry, np.array([p.centre for p in of.passes], np.int64)) for of in runs]
-    driven = iter(work.map("runs", partial(drive_segment, match=match), [segment for of in cut for segment in of]))
+    driven = work.map_groups(
+        "runs",
+        partial(drive_segment, match=match),
+        [cut_segments(of.sweeps, of.odometry, np.array([p.centre for p in of.passes], np.int64)) for of in runs],
+    )
     return [
-        DrivenRun(
-            of.run, of.wheels, join_segments(of.sweeps, of.odometry, list(islice(driven, len(segments)))), of.passes
-        )
-        for of, segments in zip(runs, cut, strict=True)
+        DrivenRun(of.run, of.wheels, join_segments(of.sweeps, of.odometry, segments), of.passes)
+        for of, segments in zip(runs, driven, strict=True)
     ]
 
 

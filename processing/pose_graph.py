@@ -117,6 +117,21 @@ def normal_equations(poses: Array, links: Links, weights: Array, pattern: Patter
 
 
 @njit(cache=True)
+def _add_product(a: Array, b: Array, out: Array) -> None:
+    """out += aᵀ b, of 3 × 3."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+
+
+@njit(cache=True)
+def _add_moved(a: Array, b: Array, out: Array) -> None:
+    """out += aᵀ b, of a vector b (3,)."""
+    for i in range(3):
+        out[i] += a[0, i] * b[0] + a[1, i] * b[1] + a[2, i] * b[2]
+
+
+@njit(cache=True)
 def _assemble(
     poses: Array,
     ends: Ints,
@@ -129,7 +144,9 @@ def _assemble(
     below: Array,
     gradient: Array,
 ) -> None:
+    # Small matrices are written out: a product of two 3 × 3 arrays costs more than ten such loops.
     j_a, j_b, error = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    i_a, i_b, pull = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     j_a[2, 2], j_b[2, 2] = -1.0, 1.0
     for k in range(len(ends)):
         a, b = ends[k]
@@ -145,16 +162,24 @@ def _assemble(
         j_b[0, 0], j_b[0, 1], j_b[1, 0], j_b[1, 1] = c, s, -s, c
         j_a[0, 0], j_a[0, 1], j_a[1, 0], j_a[1, 1] = -c, -s, s, -c
         j_a[0, 2], j_a[1, 2] = y, -x
-        information = weights[k] * informations[k]
-        i_a, i_b, pull = information @ j_a, information @ j_b, information @ error
+        for i in range(3):
+            u, v, w = informations[k, i]
+            u, v, w = weights[k] * u, weights[k] * v, weights[k] * w
+            pull[i] = u * error[0] + v * error[1] + w * error[2]
+            for j in range(3):
+                i_a[i, j] = u * j_a[0, j] + v * j_a[1, j] + w * j_a[2, j]
+                i_b[i, j] = u * j_b[0, j] + v * j_b[1, j] + w * j_b[2, j]
         if p >= 0:
-            diagonal[p] += j_a.T @ i_a
-            gradient[p] += j_a.T @ pull
+            _add_product(j_a, i_a, diagonal[p])
+            _add_moved(j_a, pull, gradient[p])
         if q >= 0:
-            diagonal[q] += j_b.T @ i_b
-            gradient[q] += j_b.T @ pull
+            _add_product(j_b, i_b, diagonal[q])
+            _add_moved(j_b, pull, gradient[q])
         if slots[k] >= 0:
-            below[slots[k]] += j_a.T @ i_b if p > q else j_b.T @ i_a
+            if p > q:
+                _add_product(j_a, i_b, below[slots[k]])
+            else:
+                _add_product(j_b, i_a, below[slots[k]])
 
 
 def solve(

@@ -4,6 +4,7 @@ In: scans one after the other, as they are read. Out: `Ranges`, rows of which ar
 needs them. It is small itself, and goes to other processes as it is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from hw_profiles.errors import RTLogError
 
 Ints = NDArray[np.int64]
 Rows = NDArray[np.float32]
+
+AT_ONCE = 500  # rows that are copied together
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,10 @@ class Ranges:
         found = found[:, ::-1] if self.is_mirrored else found
         return found if np.ndim(rows) else found[0]
 
+    def mirrored(self) -> "Ranges":
+        """With the last beam first."""
+        return replace(self, is_mirrored=not self.is_mirrored)
+
     def cut(self, first: int, last: int) -> "Ranges":
         """Rows `first` to `last`, the last included."""
         return replace(self, shape=(last + 1 - first, self.shape[1]), first=self.first + first)
@@ -60,18 +67,20 @@ class RangeFile:
         self._file = path.open("w+b")
 
     def append(self, ranges: Rows) -> None:
-        """Append a scan (b,). Raises: RTLogError: the disk is full."""
+        """Append a scan (b,), or several (k, b). Raises: RTLogError: the disk is full."""
+        ranges = np.atleast_2d(ranges)
+        rows, beams = ranges.shape
         if not self.rows:
-            self.beams = len(ranges)
+            self.beams = beams
         try:
-            if len(ranges) > self.beams:
-                self._widen(len(ranges))
-            elif len(ranges) < self.beams:
-                ranges = np.concatenate([ranges, np.full(self.beams - len(ranges), np.nan, np.float32)])
+            if beams > self.beams:
+                self._widen(beams)
+            elif beams < self.beams:
+                ranges = np.hstack([ranges, np.full((rows, self.beams - beams), np.nan, np.float32)])
             self._file.write(ranges.astype(np.float32, copy=False).tobytes())
         except OSError as error:
             raise self._no_room(error) from error
-        self.rows += 1
+        self.rows += rows
 
     def _widen(self, beams: int) -> None:
         """Rare, so not in pieces: a scan is longer than all before it."""
@@ -82,13 +91,13 @@ class RangeFile:
         self._file.write(wide.tobytes())
         self.beams = beams
 
-    def finish(self, is_mirrored: bool) -> Ranges:
+    def finish(self) -> Ranges:
         """What was written, ready to be read. Raises: RTLogError: the disk is full."""
         try:
             self._file.flush()
         except OSError as error:
             raise self._no_room(error) from error
-        return Ranges(self.path, (self.rows, self.beams), is_mirrored=is_mirrored)
+        return Ranges(self.path, (self.rows, self.beams))
 
     def _no_room(self, error: OSError) -> RTLogError:
         return RTLogError(f"{self.path}: the scans cannot be kept here: {error.strerror or error}; set TMPDIR")
@@ -99,3 +108,16 @@ class RangeFile:
             self._file.close()
         except OSError as error:
             raise self._no_room(error) from error
+
+
+def join_ranges(parts: Sequence[Ranges], path: Path) -> Ranges:
+    """Move all into one file. Raises: RTLogError: the disk is full."""
+    file = RangeFile(path)
+    try:
+        for part in parts:
+            for first in range(0, len(part), AT_ONCE):
+                file.append(part[first : first + AT_ONCE])
+            part.path.unlink()
+        return file.finish()
+    finally:
+        file.close()

@@ -8,8 +8,6 @@ order that is true.
 """
 
 import hashlib
-from bisect import bisect_left
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,17 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
-from hw_profiles.profile import ROLES, Profile, parse_profile
-from processing.read_scans import ScanReader, Scans
-from rtlog_client.log_file import LogInfo, read_info, read_messages
+from hw_profiles.profile import ROLES, Profile
+from processing.read_scans import ReadScans, ScanReader, Scans, join_scans
+from processing.recordings import Source, Window, cut_windows, survey
+from processing.stamps import rising_stamps, take_over_times
+from rtlog_client.log_file import read_messages
 from rtlog_server.messages import decode, to_ns
-from rtlog_server.topics import BY_NAME, JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS, TICK
+from rtlog_server.topics import TAGS, TICK
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
-
-SCAN_TOPICS = (PRIMARY_SCAN.name, "/scan")
-BARE_PROFILE = Profile(schema=1, name="scanner at the vehicle's origin")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +56,17 @@ class Run:
     ticks: int
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What a window holds, in the order of the recording."""
+
+    tick_log_times_ns: Stamps  # (t,)
+    scans: ReadScans
+    motion_ns: Stamps  # (m,) of the encoders or of /odom
+    motions: Array  # (m, 2) both wheels [rad], or (m, 3) poses
+    reads: list[tuple[int, str]]  # stamp [ns], EPC
+
+
 def read_log(
     path: Path, profile: Profile | None = None, further: Sequence[Path] = (), scratch: Path | None = None
 ) -> Run:
@@ -67,152 +75,101 @@ def read_log(
     With a `scratch` folder, the ranges of its scans stay in a file there; without, they are in memory.
 
     Raises:
-        BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders, or messages that
-            are not what their topics say.
+        BadInputError: as `survey` and `read_window`.
     """
-    info = _join([read_info(part) for part in (path, *further)])
-    profile = _profile(path, info, profile)
-    scan_topic = next((topic for topic in SCAN_TOPICS if info.message_counts.get(topic)), None)
-    if scan_topic is None:
-        raise BadInputError(f"{path}: no laser scans ({' or '.join(SCAN_TOPICS)}); there is nothing to map")
-    encoder_topic = next((t for t in (JOINT_STATES.name, ODOMETRY.name) if info.message_counts.get(t)), None)
-    if encoder_topic is None:
-        raise BadInputError(f"{path}: neither {JOINT_STATES.name} nor {ODOMETRY.name}; the motion is unknown")
-    for topic, wanted in ((scan_topic, PRIMARY_SCAN), (encoder_topic, BY_NAME[encoder_topic]), (TAGS.name, TAGS)):
-        if (found := info.msgtypes.get(topic, wanted.msgtype)) != wanted.msgtype:
-            raise BadInputError(f"{path}: {topic} holds {found}, not {wanted.msgtype}")
-    if info.message_counts[scan_topic] < 2:
-        raise BadInputError(f"{path}: {scan_topic} holds 1 scan; a drive needs more")
-    if encoder_topic == JOINT_STATES.name and not profile.encoders:
-        raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
-    with (
-        TemporaryDirectory() as nowhere,
-        ScanReader(path, (scratch or Path(nowhere)) / f"{info.run_id}.ranges") as scans,
-    ):
-        return _read((path, *further), info, profile, (scan_topic, encoder_topic), scans, in_memory=scratch is None)
+    source = survey((path, *further), profile)
+    if scratch is not None:
+        return join_windows(source, [read_window(window, scratch) for window in cut_windows(source)], scratch)
+    with TemporaryDirectory() as nowhere:
+        run = read_log(path, profile, further, Path(nowhere))
+        return replace(run, scans=replace(run.scans, ranges=run.scans.ranges[:]))
 
 
-def _read(
-    parts: tuple[Path, ...],
-    info: LogInfo,
-    profile: Profile,
-    topics: tuple[str, str],
-    scans: ScanReader,
-    in_memory: bool,
-) -> Run:
-    (scan_topic, encoder_topic), path = topics, parts[0]
-    motions: list[tuple[int, Any]] = []
+def read_window(window: Window, scratch: Path) -> Readings:
+    """Read it; the ranges of its scans go to a file in the folder `scratch`.
+
+    Raises:
+        BadInputError: messages that are not what their topics say.
+        RTLogError: the disk is full.
+    """
+    source = window.source
+    motion_ns: list[int] = []
+    motions: list[tuple[float, ...]] = []
     reads: list[tuple[int, str]] = []
-    wheels = _wheels_of(profile) if encoder_topic == JOINT_STATES.name else _pose_of
+    motion_of = _wheels_of(source.profile) if source.has_wheels else _pose_of
     tick_log_times: list[int] = []
-    for topic, log_time_ns, message in _decoded(parts, [TICK.name, scan_topic, encoder_topic, TAGS.name]):
-        if topic == TICK.name:
-            tick_log_times.append(log_time_ns)
-        elif topic == scan_topic:
-            scans.add(message, log_time_ns)
-        elif topic == encoder_topic:
-            value = wheels(message)
-            if value is not None and np.all(np.isfinite(value)):
-                motions.append((to_ns(message.header.stamp), value))
-        else:
-            reads.extend((to_ns(read.stamp), str(read.epc).upper()) for read in message.reads)
-    if not motions:
+    with ScanReader(scratch / f"{source.info.run_id}.{window.number}.ranges") as scans:
+        for topic, log_time_ns, message in _decoded(
+            window, [TICK.name, source.scan_topic, source.encoder_topic, TAGS.name]
+        ):
+            if topic == TICK.name:
+                tick_log_times.append(log_time_ns)
+            elif topic == source.scan_topic:
+                scans.add(message, log_time_ns)
+            elif topic == source.encoder_topic:
+                motion = motion_of(message)
+                if motion is not None and np.all(np.isfinite(motion)):
+                    motion_ns.append(to_ns(message.header.stamp))
+                    motions.append(motion)
+            else:
+                reads.extend((to_ns(read.stamp), str(read.epc).upper()) for read in message.reads)
+        return Readings(
+            np.array(tick_log_times, np.int64),
+            scans.finish(),
+            np.array(motion_ns, np.int64),
+            np.array(motions, np.float64).reshape(-1, 2 if source.has_wheels else 3),
+            reads,
+        )
+
+
+def join_windows(source: Source, windows: Sequence[Readings], scratch: Path) -> Run:
+    """The whole recording, from all its windows.
+
+    Raises:
+        BadInputError: what it holds does not fit together.
+        RTLogError: the disk is full.
+    """
+    path, profile = source.parts[0], source.profile
+    motion_ns = np.concatenate([window.motion_ns for window in windows])
+    motion = np.concatenate([window.motions for window in windows])
+    reads = sorted(read for window in windows for read in window.reads)
+    if not len(motion_ns):
         roles = [encoder.name for encoder in profile.encoders]
-        raise BadInputError(f"{path}: no message on {encoder_topic} holds a reading of {' and '.join(roles)}")
-    reads.sort()
-    motion_ns = np.array([ns for ns, _ in motions], np.int64)
-    motion = np.array([value for _, value in motions], np.float64)
-    scan_ns = scans.stamps_ns
-    rising_motion_ns, rising_scan_ns = rising_stamps(motion_ns), rising_stamps(scan_ns)
+        raise BadInputError(f"{path}: no message on {source.encoder_topic} holds a reading of {' and '.join(roles)}")
+    scans = join_scans(path, [window.scans for window in windows], scratch / f"{source.info.run_id}.ranges")
+    rising_motion_ns, rising_scan_ns = rising_stamps(motion_ns), rising_stamps(scans.stamps_ns)
     if rising_motion_ns[0] > rising_scan_ns[-1] or rising_scan_ns[0] > rising_motion_ns[-1]:
-        raise BadInputError(f"{path}: by their stamps, {scan_topic} and {encoder_topic} have no time in common")
+        what = f"{source.scan_topic} and {source.encoder_topic} have no time in common"
+        raise BadInputError(f"{path}: by their stamps, {what}")
     epoch_ns = int(min(rising_motion_ns[0], rising_scan_ns[0]))
     motion_times = np.asarray((rising_motion_ns - epoch_ns) * 1e-9, np.float64)
     scan_times = np.asarray((rising_scan_ns - epoch_ns) * 1e-9, np.float64)
-    _take_over_times(scan_ns, scan_times, motion_ns, motion_times)
-    have_wheels = encoder_topic == JOINT_STATES.name
+    take_over_times(scans.stamps_ns, scan_times, motion_ns, motion_times)
+    tick_log_times_ns = np.concatenate([window.tick_log_times_ns for window in windows])
     return Run(
-        run_id=info.run_id,
-        sha256=_digest(parts),
+        run_id=source.info.run_id,
+        sha256=_digest(source.parts),
         profile=profile,
-        scans=scans.scans(scan_times, in_memory),
-        scan_ticks=scans.ticks(tick_log_times),
+        scans=replace(scans, times=scan_times),
+        scan_ticks=ticks_of(np.concatenate([window.scans.log_times_ns for window in windows]), tick_log_times_ns),
         epoch_ns=epoch_ns,
         motion_ns=motion_ns,
         motion_times=motion_times,
-        wheels=motion if have_wheels else None,
-        odometry=None if have_wheels else motion,
+        wheels=motion if source.has_wheels else None,
+        odometry=None if source.has_wheels else motion,
         tags=TagReadings(
             np.array([(ns - epoch_ns) * 1e-9 for ns, _ in reads], np.float64),
             np.array([epc for _, epc in reads], np.str_),
         ),
-        ticks=info.message_counts.get(TICK.name, len(scan_ns)),
+        ticks=source.info.message_counts.get(TICK.name, len(scans.stamps_ns)),
     )
 
 
-def rising_stamps(stamps_ns: Stamps) -> Stamps:
-    """Stamps (n,) that rise strictly, in the order of the recording.
-
-    The longest rising run among the stamps is taken at its word; the others are spread evenly over the gaps in it that
-    they were recorded in, or go on at the usual pace before its first and after its last.
-    """
-    believed, index = _longest_rising(stamps_ns), np.arange(len(stamps_ns))
-    first, last = believed[0], believed[-1]
-    since = stamps_ns[believed] - stamps_ns[first]
-    spread = np.interp(index, believed, since)
-    pace = np.median(np.diff(since) / np.diff(believed)) if len(believed) > 1 else 0.0
-    spread += pace * (np.minimum(index - first, 0) + np.maximum(index - last, 0))
-    rising = np.maximum.accumulate(np.round(spread).astype(np.int64) - index) + index
-    return np.asarray(stamps_ns[first] + rising, np.int64)
-
-
-def _longest_rising(stamps_ns: Stamps) -> NDArray[np.int64]:
-    """Indices of the longest strictly rising run, which may leave stamps out (Schensted 1961).
-
-    Taken from the last stamp to the first, so that of two that contradict each other the earlier is believed.
-    """
-    firsts: list[int] = []  # negated: the highest stamp that a run of each length can begin with
-    starts: list[int] = []  # and its index
-    after = [-1] * len(stamps_ns)
-    for k in range(len(stamps_ns) - 1, -1, -1):
-        negated = -int(stamps_ns[k])
-        length = bisect_left(firsts, negated)
-        after[k] = starts[length - 1] if length else -1
-        firsts[length : length + 1], starts[length : length + 1] = [negated], [k]
-    run = [starts[-1]]
-    while after[run[-1]] >= 0:
-        run.append(after[run[-1]])
-    return np.array(run, np.int64)
-
-
-def _take_over_times(scan_ns: Stamps, scan_times: Array, motion_ns: Stamps, motion_times: Array) -> None:
-    """A scan with the very stamp of an odometry message belongs to that message, whatever backward stamps did to
-    either.
-    """
-    order = np.argsort(motion_ns, kind="stable")
-    at = np.minimum(np.searchsorted(motion_ns[order], scan_ns), len(order) - 1)
-    same = motion_ns[order[at]] == scan_ns
-    scan_times[same] = motion_times[order[at[same]]]
-    steps = np.arange(len(scan_ns)) * 1e-9
-    scan_times[:] = np.maximum.accumulate(scan_times - steps) + steps
-
-
-def _profile(path: Path, info: LogInfo, fallback: Profile | None) -> Profile:
-    """A profile named by the user wins over the one inside: they name it because that one is wrong or missing."""
-    if fallback is not None:
-        return fallback
-    if info.profile_toml is not None:
-        return parse_profile(info.profile_toml, source=f"inside {path}")
-    return BARE_PROFILE
-
-
-def _join(parts: list[LogInfo]) -> LogInfo:
-    """What the parts of a recording say together."""
-    counts = Counter[str]()
-    for part in parts:
-        counts.update(part.message_counts)
-    types = {topic: msgtype for part in parts for topic, msgtype in part.msgtypes.items()}
-    return replace(parts[0], message_counts=dict(counts), msgtypes=types)
+def ticks_of(scan_log_times_ns: Stamps, tick_log_times_ns: Stamps) -> Stamps:
+    """The tick of each scan, counted from the first of the recording; without ticks its own number."""
+    if not len(tick_log_times_ns):
+        return np.arange(len(scan_log_times_ns))
+    return np.searchsorted(tick_log_times_ns, scan_log_times_ns, side="right") - 1
 
 
 def _digest(paths: Sequence[Path]) -> str:
@@ -225,14 +182,13 @@ def _digest(paths: Sequence[Path]) -> str:
     return found.hexdigest()
 
 
-def _decoded(paths: Sequence[Path], topics: list[str]) -> Iterator[tuple[str, int, Any]]:
-    for path in paths:
-        for message in read_messages(path, topics):
-            try:
-                inside = None if message.topic == TICK.name else decode(message.data, message.msgtype)
-                yield message.topic, message.log_time_ns, inside
-            except (ValueError, KeyError) as error:
-                raise BadInputError(f"{path}: {message.topic} at {message.log_time_ns} ns: {error}") from error
+def _decoded(window: Window, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
+    for message in read_messages(window.path, topics, window.start_ns, window.end_ns):
+        try:
+            inside = None if message.topic == TICK.name else decode(message.data, message.msgtype)
+            yield message.topic, message.log_time_ns, inside
+        except (ValueError, KeyError) as error:
+            raise BadInputError(f"{window.path}: {message.topic} at {message.log_time_ns} ns: {error}") from error
 
 
 def _wheels_of(profile: Profile) -> Callable[[Any], tuple[float, float] | None]:

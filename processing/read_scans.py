@@ -3,6 +3,7 @@
 In: the messages in the order of the recording. Out: ranges as they were measured, beams counter-clockwise.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
-from processing.range_file import RangeFile, Ranges
+from processing.range_file import RangeFile, Ranges, join_ranges
 from rtlog_server.messages import to_ns
 
 Array = NDArray[np.float64]
@@ -36,16 +37,24 @@ class Scans:
         return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1], dtype=np.float64)
 
 
-class ScanReader:
-    """Takes the scans of `recording` as they come; their ranges go to the file `scratch`."""
+@dataclass(frozen=True, slots=True)
+class ReadScans:
+    """What was read of the scans in a stretch of a recording: k of them."""
 
-    def __init__(self, recording: Path, scratch: Path) -> None:
-        self._recording = recording
+    stamps_ns: Stamps  # (k,)
+    log_times_ns: Stamps  # (k,)
+    ranges: Ranges  # (k, B), beams as they were recorded
+    settings: dict[tuple[float, float], tuple[float, float, float]]  # angle_min, angle_increment, time_increment
+
+
+class ScanReader:
+    """Takes the scans of a stretch as they come; their ranges go to the file `scratch`."""
+
+    def __init__(self, scratch: Path) -> None:
         self._file = RangeFile(scratch)
         self._stamps_ns: list[int] = []
         self._log_times_ns: list[int] = []
-        self._settings: set[tuple[float, float]] = set()
-        self._last: Any = None
+        self._settings: dict[tuple[float, float], tuple[float, float, float]] = {}
 
     def add(self, message: Any, log_time_ns: int) -> None:
         ranges = np.array(message.ranges, np.float32)
@@ -55,35 +64,13 @@ class ScanReader:
         self._file.append(ranges)
         self._stamps_ns.append(to_ns(message.header.stamp))
         self._log_times_ns.append(log_time_ns)
-        self._settings.add((round(float(message.angle_increment), 7), round(float(message.angle_min), 5)))
-        self._last = message
+        start, increment = float(message.angle_min), float(message.angle_increment)
+        self._settings[round(increment, 7), round(start, 5)] = start, increment, float(message.time_increment)
 
-    @property
-    def stamps_ns(self) -> Stamps:
-        return np.array(self._stamps_ns, np.int64)
-
-    def ticks(self, tick_log_times_ns: list[int]) -> Stamps:
-        """The tick of each scan, counted from the first of the recording; without ticks its own number."""
-        if not tick_log_times_ns:
-            return np.arange(len(self._stamps_ns))
-        return np.searchsorted(tick_log_times_ns, self._log_times_ns, side="right") - 1
-
-    def scans(self, times: Array, in_memory: bool) -> Scans:
-        """All that were added, at these times (n,). Raises: BadInputError: they do not fit together."""
-        if len(self._settings) > 1:
-            what = "the scanner's angles change within the recording; record each setting by itself"
-            raise BadInputError(f"{self._recording}: {what}")
-        if not abs(self._last.angle_increment) > 1e-5:
-            raise BadInputError(f"{self._recording}: the scans have an angle_increment of zero")
-        if self._file.beams < 10:
-            raise BadInputError(f"{self._recording}: scans of {self._file.beams} beams cannot be matched")
-        start, increment = float(self._last.angle_min), float(self._last.angle_increment)
-        time_increment, mirrored = float(self._last.time_increment), increment < 0
-        if mirrored:  # a scanner mounted upside down, or a driver that counts clockwise
-            start, increment = start + increment * (self._file.beams - 1), -increment
-            time_increment = -time_increment  # the first ray is now the last beam
-        ranges = self._file.finish(mirrored)
-        return Scans(self.stamps_ns, times, ranges[:] if in_memory else ranges, start, increment, time_increment)
+    def finish(self) -> ReadScans:
+        """All that were added. Raises: RTLogError: the disk is full."""
+        stamps_ns, log_times_ns = np.array(self._stamps_ns, np.int64), np.array(self._log_times_ns, np.int64)
+        return ReadScans(stamps_ns, log_times_ns, self._file.finish(), self._settings)
 
     def __enter__(self) -> Self:
         return self
@@ -92,3 +79,31 @@ class ScanReader:
         self, _kind: type[BaseException] | None, _value: BaseException | None, _trace: TracebackType | None
     ) -> None:
         self._file.close()
+
+
+def join_scans(recording: Path, parts: Sequence[ReadScans], scratch: Path) -> Scans:
+    """The scans of all stretches, their ranges in the one file `scratch`; their times are still to be found.
+
+    Raises:
+        BadInputError: they do not fit together.
+        RTLogError: the disk is full.
+    """
+    settings = {key: setting for part in parts for key, setting in part.settings.items()}
+    if len(settings) > 1:
+        raise BadInputError(
+            f"{recording}: the scanner's angles change within the recording; record each setting by itself"
+        )
+    ((start, increment, time_increment),) = settings.values()
+    if not abs(increment) > 1e-5:
+        raise BadInputError(f"{recording}: the scans have an angle_increment of zero")
+    ranges = join_ranges([part.ranges for part in parts], scratch)
+    beams = ranges.shape[1]
+    if beams < 10:
+        raise BadInputError(f"{recording}: scans of {beams} beams cannot be matched")
+    if (
+        increment < 0
+    ):  # a scanner mounted upside down, or a driver that counts clockwise: the first ray is the last beam
+        start, increment, time_increment = start + increment * (beams - 1), -increment, -time_increment
+        ranges = ranges.mirrored()
+    stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+    return Scans(stamps_ns, np.empty(len(stamps_ns)), ranges, start, increment, time_increment)

@@ -1,16 +1,49 @@
-"""Which files are one run: a recorder may split a run into parts, which share its run id.
+"""Recordings, before they are read: which files are one run, whether they are fit to be mapped, how to share them out.
 
-In: recordings in any order. Out: for each run its parts in order of time. Law: what is one run is told by what files
-say of themselves, never by their names, and what cannot be told is refused before any work.
+In: recordings in any order; a recorder may split a run into parts, which share its run id. Out: a `Source` for each
+run, and windows of it. Law: what is one run is told by what files say of themselves, never by their names, and what
+cannot be told is refused before any work.
 """
 
+from collections import Counter
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 from hw_profiles.errors import BadInputError
-from rtlog_client.log_file import LogInfo, read_info
+from hw_profiles.profile import Profile, parse_profile
+from rtlog_client.log_file import FOREVER_NS, LogInfo, read_info
+from rtlog_server.topics import BY_NAME, JOINT_STATES, ODOMETRY, PRIMARY_SCAN, TAGS
 
+SCAN_TOPICS = (PRIMARY_SCAN.name, "/scan")
+BARE_PROFILE = Profile(schema=1, name="scanner at the vehicle's origin")
 MAX_SHARED_NS = 10**9  # by so much two parts may overlap: messages of one tick on either side of the cut
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording that is fit to be read, and what there is to know before it is."""
+
+    parts: tuple[Path, ...]
+    info: LogInfo  # of all parts together
+    profile: Profile
+    scan_topic: str
+    encoder_topic: str
+
+    @property
+    def has_wheels(self) -> bool:
+        return self.encoder_topic == JOINT_STATES.name
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A stretch of one part, to be read by itself: log times from `start_ns` to before `end_ns`."""
+
+    source: Source
+    number: int
+    path: Path
+    start_ns: int
+    end_ns: int
 
 
 def group_parts(recordings: list[Path]) -> list[tuple[Path, ...]]:
@@ -37,3 +70,55 @@ def group_parts(recordings: list[Path]) -> list[tuple[Path, ...]]:
             if boots[0] != boots[1] or boots[0] is None:
                 raise BadInputError(f"{a} and {b} are both called run {run_id}, and are not parts of one boot's run")
     return [tuple(path for path, _ in parts) for parts in runs.values()]
+
+
+def survey(parts: tuple[Path, ...], profile: Profile | None) -> Source:
+    """What a recording holds; its parts in order of time.
+
+    Raises:
+        BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders.
+    """
+    path, info = parts[0], _join([read_info(part) for part in parts])
+    profile = _profile(path, info, profile)
+    scan_topic = next((topic for topic in SCAN_TOPICS if info.message_counts.get(topic)), None)
+    if scan_topic is None:
+        raise BadInputError(f"{path}: no laser scans ({' or '.join(SCAN_TOPICS)}); there is nothing to map")
+    encoder_topic = next((t for t in (JOINT_STATES.name, ODOMETRY.name) if info.message_counts.get(t)), None)
+    if encoder_topic is None:
+        raise BadInputError(f"{path}: neither {JOINT_STATES.name} nor {ODOMETRY.name}; the motion is unknown")
+    for topic, wanted in ((scan_topic, PRIMARY_SCAN), (encoder_topic, BY_NAME[encoder_topic]), (TAGS.name, TAGS)):
+        if (found := info.msgtypes.get(topic, wanted.msgtype)) != wanted.msgtype:
+            raise BadInputError(f"{path}: {topic} holds {found}, not {wanted.msgtype}")
+    if info.message_counts[scan_topic] < 2:
+        raise BadInputError(f"{path}: {scan_topic} holds 1 scan; a drive needs more")
+    if encoder_topic == JOINT_STATES.name and not profile.encoders:
+        raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
+    return Source(parts, info, profile, scan_topic, encoder_topic)
+
+
+def cut_windows(source: Source) -> list[Window]:
+    """All of a recording, so that several processes can read it."""
+    spans = [
+        (path, start, end)
+        for path in source.parts
+        for start, end in pairwise([0, *read_info(path).cuts_ns, FOREVER_NS])
+    ]
+    return [Window(source, number, *span) for number, span in enumerate(spans)]
+
+
+def _profile(path: Path, info: LogInfo, fallback: Profile | None) -> Profile:
+    """A profile named by the user wins over the one inside: they name it because that one is wrong or missing."""
+    if fallback is not None:
+        return fallback
+    if info.profile_toml is not None:
+        return parse_profile(info.profile_toml, source=f"inside {path}")
+    return BARE_PROFILE
+
+
+def _join(parts: list[LogInfo]) -> LogInfo:
+    """What the parts of a recording say together."""
+    counts = Counter[str]()
+    for part in parts:
+        counts.update(part.message_counts)
+    types = {topic: msgtype for part in parts for topic, msgtype in part.msgtypes.items()}
+    return replace(parts[0], message_counts=dict(counts), msgtypes=types)

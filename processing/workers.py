@@ -2,6 +2,9 @@
 
 In: a function and its items. Out: the results in the order of the items. Law: when the work ends early, by Ctrl-C,
 SIGTERM or an error, the processes end at once and without a word.
+
+The processes are forked when there is first something to do: they have all modules at once, where a fresh Python takes
+a second to load them. So a program that has threads of its own must not ask for more than one job.
 """
 
 import multiprocessing
@@ -11,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from typing import Any, Self, TypeVar
 
 from tqdm import tqdm
@@ -25,12 +29,9 @@ class Workers:
     """`jobs` processes, or with one job this one."""
 
     def __init__(self, jobs: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(jobs, context) if jobs > 1 else None
-        if self._pool is not None:
-            with _deaf_children():
-                for _ in range(jobs):
-                    self._pool.submit(_load)  # while the first recording is read
+        fork = multiprocessing.get_context("fork")
+        self._pool = ProcessPoolExecutor(jobs, fork, _end_like_any_other) if jobs > 1 else None
+        self._jobs = jobs
 
     def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """Raises: RTLogError: a process died; whatever `function` raises."""
@@ -40,7 +41,7 @@ class Workers:
             return [function(item) for item in bar(items)]
         try:
             with _deaf_children():
-                results = self._pool.map(function, items)
+                results = self._pool.map(function, items, chunksize=max(1, len(items) // (32 * self._jobs)))
             return list(bar(results))
         except BrokenProcessPool as error:
             raise RTLogError("a process died, perhaps for want of memory; try fewer --jobs") from error
@@ -48,6 +49,14 @@ class Workers:
     def starmap(self, label: str, function: Callable[..., Result], items: Iterable[tuple[Any, ...]]) -> list[Result]:
         """The same; every item holds all arguments."""
         return self.map(label, partial(_apply, function), items)
+
+    def map_groups(
+        self, label: str, function: Callable[[Item], Result], groups: Iterable[Iterable[Item]]
+    ) -> list[list[Result]]:
+        """The same for groups of items, which are done all together: the results of each group."""
+        listed = [list(group) for group in groups]
+        results = iter(self.map(label, function, [item for group in listed for item in group]))
+        return [list(islice(results, len(group))) for group in listed]
 
     def __enter__(self) -> Self:
         return self
@@ -65,9 +74,9 @@ def _apply(function: Callable[..., Result], arguments: tuple[Any, ...]) -> Resul
     return function(*arguments)
 
 
-def _load() -> None:
-    """What a process needs to begin."""
-    import processing.pipeline  # noqa: F401  (here, for it imports this module)
+def _end_like_any_other() -> None:
+    """What the command does at SIGTERM is not for its processes."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextmanager

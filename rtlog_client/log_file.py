@@ -32,6 +32,8 @@ METADATA_NAME = "rtlog"
 LOSS_NAME = "rtlog.loss"  # topic: JSON {"received", "lost", "holes": [[first, last], …]}, sequence numbers
 PROFILE_NAME = "profile.toml"
 CHUNK_BYTES = 256 * 1024
+STRETCH_BYTES = 16 * CHUNK_BYTES  # of messages, that are worth a process of their own
+FOREVER_NS = 2**63
 RECORD = struct.Struct("<BQ")  # MCAP: opcode, length of the content
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time; the rest is data
 
@@ -56,6 +58,7 @@ class LogInfo:
     end_ns: int
     msgtypes: dict[str, str] = field(default_factory=dict)  # per topic
     lost: dict[str, int] = field(default_factory=dict)  # per topic, as the recorder counted; empty if it did not
+    cuts_ns: tuple[int, ...] = ()  # log times that cut it into stretches of about STRETCH_BYTES; empty without an index
 
 
 class LogWriter:
@@ -206,19 +209,35 @@ def read_info(path: Path) -> LogInfo:
         end_ns=statistics.message_end_time,
         msgtypes=msgtypes,
         lost={topic: int(json.loads(text)["lost"]) for topic, text in records.get(LOSS_NAME, {}).items()},
+        cuts_ns=_cuts(summary),
     )
 
 
-def read_messages(path: Path, topics: list[str] | None = None) -> Iterator[LoggedMessage]:
-    """The messages in order of log_time; `topics` None: all. Raises: BadInputError as `read_info`, also midway."""
+def _cuts(summary: Summary) -> tuple[int, ...]:
+    cuts_ns, size = [], 0
+    for start_ns, chunk_size in sorted((of.message_start_time, of.uncompressed_size) for of in summary.chunk_indexes):
+        if size >= STRETCH_BYTES:
+            cuts_ns.append(start_ns)
+            size = 0
+        size += chunk_size
+    return tuple(cuts_ns)
+
+
+def read_messages(
+    path: Path, topics: list[str] | None = None, start_ns: int = 0, end_ns: int = FOREVER_NS
+) -> Iterator[LoggedMessage]:
+    """The messages with a log_time from `start_ns` to before `end_ns`, in its order; `topics` None: all.
+
+    Raises: BadInputError as `read_info`, also midway.
+    """
     with _open(path) as file:
         try:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
             if summary is not None and summary.chunk_indexes:
-                yield from _indexed_messages(file, summary, topics)
+                yield from _indexed_messages(file, summary, topics, start_ns, end_ns)
                 return
-            for schema, channel, message in reader.iter_messages(topics=topics):
+            for schema, channel, message in reader.iter_messages(topics=topics, start_time=start_ns, end_time=end_ns):
                 yield LoggedMessage(
                     channel.topic,
                     schema.name if schema else "",
@@ -231,7 +250,9 @@ def read_messages(path: Path, topics: list[str] | None = None) -> Iterator[Logge
             raise _wrong(path, error) from error
 
 
-def _indexed_messages(file: BinaryIO, summary: Summary, topics: list[str] | None) -> Iterator[LoggedMessage]:
+def _indexed_messages(
+    file: BinaryIO, summary: Summary, topics: list[str] | None, start_ns: int, end_ns: int
+) -> Iterator[LoggedMessage]:
     """The messages chunk by chunk: many times as fast as the library's queue. As there, messages of one log_time come
     in the order of the file.
     """
@@ -244,7 +265,9 @@ def _indexed_messages(file: BinaryIO, summary: Summary, topics: list[str] | None
         chunk
         for chunk in summary.chunk_indexes
         # some writers leave the index of a chunk's messages out: then it may hold any
-        if not chunk.message_index_offsets or channels.keys() & chunk.message_index_offsets.keys()
+        if (not chunk.message_index_offsets or channels.keys() & chunk.message_index_offsets.keys())
+        and chunk.message_start_time < end_ns
+        and chunk.message_end_time >= start_ns
     ]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
     waiting: list[tuple[int, int, int, LoggedMessage]] = []  # what a chunk that is still to come may precede
@@ -257,7 +280,7 @@ def _indexed_messages(file: BinaryIO, summary: Summary, topics: list[str] | None
             at += RECORD.size
             if opcode == Opcode.MESSAGE:
                 channel, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, at)
-                if channel in channels:
+                if channel in channels and start_ns <= log_ns < end_ns:
                     content = data[at + MESSAGE.size : at + length]
                     message = LoggedMessage(*channels[channel], content, log_ns, publish_ns, sequence)
                     waiting.append((log_ns, chunk.chunk_start_offset, at, message))

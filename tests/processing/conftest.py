@@ -12,7 +12,8 @@ from processing.edge_placement import Placed
 from processing.geometry import align, compose
 from processing.graph import Graph, build_graph
 from processing.pieces import SolvedPiece, solve_piece
-from processing.pipeline import Config, DrivenRun, drive_through, piece_input, piece_names, read_run
+from processing.pipeline import DrivenRun, drive_through, piece_input, piece_names
+from processing.read_runs import read_runs
 from processing.scan_matching import match_scans
 from processing.simulation.simulate import simulate
 from processing.tum import read_tum
@@ -91,7 +92,8 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def drive_both(world: Path) -> list[DrivenRun]:
-    runs = [read_run((world / f"small-{run}.mcap",), None, Config(), None) for run in ("around", "back")]
+    recordings = [world / f"small-{run}.mcap" for run in ("around", "back")]
+    runs = read_runs(recordings, None, with_tags=True, scratch=world, work=Workers(1))
     return drive_through(runs, Workers(1), match_scans)
 
 

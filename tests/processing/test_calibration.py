@@ -8,20 +8,28 @@ from processing.calibration import (
     LEAST_NOISE,
     MAX_SIGMA,
     PRIOR,
+    Pairs,
     calibrate,
+    compare_strides,
+    cut_strides,
     fit_scale,
-    measure_pairs,
+    join_pairs,
     scale_of,
     stride_pairs,
 )
 from processing.pipeline import DrivenRun
+from processing.read_log import Run
+
+
+def pairs_of(run: Run) -> Pairs:
+    return join_pairs([compare_strides(strides) for strides in cut_strides(run)])
 
 
 def test_the_small_mine_shows_that_its_wheels_count_too_little(driven: list[DrivenRun]) -> None:
     for of in driven:  # its world has wheels that are 1.0 and 0.8 % larger than the profile says
         assert of.wheels.scale == pytest.approx(1.009, abs=0.002)
         assert of.wheels.sigma < 0.001
-        assert scale_of(measure_pairs(of.run)).scale == pytest.approx(
+        assert scale_of(pairs_of(of.run)).scale == pytest.approx(
             1.0, abs=0.001
         )  # put right, nothing is left to put right
 
@@ -33,7 +41,7 @@ def test_perfect_wheels_stay_as_they_are(driven_clean: list[DrivenRun]) -> None:
 
 def test_too_little_seen_changes_nothing(driven: list[DrivenRun], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("processing.calibration.MIN_INLIERS", 1.1)  # as if no match were good enough
-    run, wheels = calibrate(driven[0].run)
+    run, wheels = calibrate(driven[0].run, pairs_of(driven[0].run))
     assert run.wheels is not None
     assert driven[0].run.wheels is not None
     assert_allclose(run.wheels, driven[0].run.wheels)

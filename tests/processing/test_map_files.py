@@ -22,7 +22,8 @@ from processing.map_files import (
     to_image,
     write_map,
 )
-from processing.occupancy_grid import Grid, stitch, store_grid
+from processing.occupancy_grid import Grid, store_grid
+from processing.stitching import stitch
 from processing.workers import Workers
 
 

@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from processing.geometry import compose, inverse, transform
-from processing.occupancy_grid import HIGHEST, HIT, LOWEST, MISS, STEP, Grid, add_grid, build_grid, stitch
+from processing.occupancy_grid import HIGHEST, HIT, LOWEST, MISS, STEP, Grid, View, build_grid
+from processing.stitching import add_grid, stitch
 
 CELL = 0.05
 ANGLES = np.radians(np.linspace(-135, 135, 541))
@@ -18,6 +19,13 @@ def scan_room(pose: np.ndarray, angles: np.ndarray = ANGLES) -> np.ndarray:
     to_x = (np.sign(c) * WIDTH / 2 - pose[0]) / c
     to_y = (np.sign(s) * HEIGHT / 2 - pose[1]) / s
     return np.minimum(to_x, to_y)
+
+
+def draw(poses: np.ndarray, ranges: np.ndarray, angles: np.ndarray, **limits: float) -> Grid:
+    """The grid of scans that were measured standing still."""
+    unit = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = np.where(np.isfinite(ranges), ranges, np.nan)[..., None] * unit
+    return build_grid([View(poses, points.astype(np.float32), ranges.astype(np.float32), angles)], **limits)
 
 
 def distance_to_wall(points: np.ndarray) -> np.ndarray:
@@ -52,7 +60,7 @@ def drive() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def room(drive: tuple[np.ndarray, np.ndarray]) -> Grid:
-    return build_grid(*drive, ANGLES)
+    return draw(*drive, ANGLES)
 
 
 def test_walls_within_one_cell_and_free_within(room: Grid) -> None:
@@ -66,7 +74,7 @@ def test_walls_within_one_cell_and_free_within(room: Grid) -> None:
 
 def test_frame_of_the_poses_is_the_frame_of_the_grid(drive, room: Grid) -> None:
     place = np.array([100.3, -50.2, 0.7])
-    moved = build_grid(compose(place, drive[0]), drive[1], ANGLES)
+    moved = draw(compose(place, drive[0]), drive[1], ANGLES)
     walls = centres(moved, moved.log_odds > 0)
     assert distance_to_wall(transform(inverse(place), walls)).max() <= CELL
     assert_allclose(moved.origin / CELL, np.round(moved.origin / CELL), atol=1e-6)
@@ -78,7 +86,7 @@ def test_a_grazed_wall_survives(drive) -> None:
     bearings = poses[:, 2:] + ANGLES
     half_m = 1.02  # inside of a cell, so that beams do pass through it before they end in it further on
     ranges = (np.sign(bearings) * half_m - poses[:, 1:2]) / np.sin(bearings)
-    grid = build_grid(poses, ranges, ANGLES)
+    grid = draw(poses, ranges, ANGLES)
     along = np.arange(5, 50, 0.05) + 0.01
     for side in (-half_m, half_m):
         assert value_at(grid, np.column_stack([along, np.full(len(along), side)])).min() > 1
@@ -87,20 +95,20 @@ def test_a_grazed_wall_survives(drive) -> None:
 def test_hits_win_within_a_scan_and_each_cell_is_told_once() -> None:
     # three beams end in one cell, a fourth passes it to a far wall; ten more pass the same free cells
     angles = np.array([0.0, 0.001, 0.002, 0.003])
-    grid = build_grid(np.zeros((1, 3)), np.array([[1.02, 1.02, 1.02, 3.02]]), angles)
+    grid = draw(np.zeros((1, 3)), np.array([[1.02, 1.02, 1.02, 3.02]]), angles)
     assert_allclose(value_at(grid, np.array([[1.02, 0.001], [0.5, 0.001]])), [HIT * STEP, MISS * STEP])
     assert_allclose(grid.log_odds.max(), HIT * STEP)
 
 
 def test_saturation(drive) -> None:
     pose = np.zeros((200, 3))
-    grid = build_grid(pose, np.repeat(scan_room(pose[0])[None], 200, axis=0), ANGLES)
+    grid = draw(pose, np.repeat(scan_room(pose[0])[None], 200, axis=0), ANGLES)
     assert_allclose([grid.log_odds.min(), grid.log_odds.max()], [LOWEST * STEP, HIGHEST * STEP])
 
 
 def test_beams_without_return_invalid_and_far_ones() -> None:
     angles = np.radians([0.0, 90.0, 180.0, -90.0])
-    grid = build_grid(np.zeros((1, 3)), np.array([[np.inf, np.nan, 30.0, -1.0]]), angles, max_range_m=20, no_return_m=5)
+    grid = draw(np.zeros((1, 3)), np.array([[np.inf, np.nan, 30.0, -1.0]]), angles, max_range_m=20, no_return_m=5)
     assert grid.log_odds.max() == 0
     free = centres(grid, grid.log_odds < 0)
     assert_allclose([free[:, 0].min(), free[:, 0].max()], [-20, 5], atol=2 * CELL)
@@ -108,7 +116,7 @@ def test_beams_without_return_invalid_and_far_ones() -> None:
 
 
 def test_no_scans_make_an_empty_grid() -> None:
-    assert build_grid(np.zeros((0, 3)), np.zeros((0, 541)), ANGLES).log_odds.size == 0
+    assert draw(np.zeros((0, 3)), np.zeros((0, 541)), ANGLES).log_odds.size == 0
 
 
 def test_stitching_at_identity_changes_nothing(room: Grid) -> None:

@@ -17,9 +17,9 @@ def write(path: Path, lengths: list[int], is_mirrored: bool = False) -> Ranges:
     file = RangeFile(path)
     for row, length in zip(ROWS, lengths, strict=True):
         file.append(row[:length])
-    ranges = file.finish(is_mirrored)
+    ranges = file.finish()
     file.close()
-    return ranges
+    return ranges.mirrored() if is_mirrored else ranges
 
 
 @pytest.mark.parametrize("is_mirrored", [False, True])
@@ -54,7 +54,7 @@ def test_a_full_disk_is_told() -> None:
     with pytest.raises(RTLogError, match="TMPDIR"):
         file.append(ROWS[1])  # longer, so what is there is written anew
     with pytest.raises(RTLogError, match="TMPDIR"):
-        file.finish(is_mirrored=False)
+        file.finish()
     with pytest.raises(RTLogError, match="TMPDIR"):
         file.close()
 

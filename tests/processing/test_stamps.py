@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from recorded_drive import START_NS
 
-from processing.read_log import rising_stamps
+from processing.stamps import rising_stamps
 
 
 @pytest.mark.parametrize("seed", range(5))
