@@ -30,8 +30,9 @@ Each simulated world with {seeds} seeds (other walls, other noise), built with e
 seeds, the worst seed in brackets. ATE: one rigid move of the whole atlas onto the truth, rms over all poses
 of all runs. RPE: relative error over 10 m and 100 m of driving. Precision and recall are those of the wall cells of the
 map: a wall drawn twice lowers the precision. NEES: squared error of the edges over their stated covariance, 3 where
-that is right ([accuracy.md](accuracy.md)); of few edges it scatters. CPU: of the build with one job;
-the first builds also compile. Where a world is large, choices that take long are left out if smaller worlds settle them.
+that is right ([accuracy.md](accuracy.md)); of few edges it scatters. CPU: of the build with
+one job; the first builds also compile. Where a world is large, choices that take long are left out if smaller worlds
+settle them.
 
 Made by `{command} > docs/choices.md` at commit {commit} on {machine}. What was chosen stands at the end.
 """
@@ -56,7 +57,8 @@ The links that the map of each run ends with (first seed, each run by itself, no
 chain. Error: rms over the key frames; of Intel the mean error of the relations. In the second column 1 % of the strong
 links are false: they have the motion of another link. The robust cost is Geman–McClure's with one corner for all
 who have one; χ² is the plain sum over the true links, smaller where nothing is doubted. gtsam takes a link's error
-along its twist, which differs from ours where the error is large. CPU: the least of three; without making gtsam's graph.
+along its twist, which differs from ours where the error is large. CPU: the least of three; without making gtsam's
+graph.
 """
 
 CHOSEN = """## What was chosen, and why

@@ -10,7 +10,8 @@ import numpy as np
 
 import processing.open_loop
 from processing.evaluation import Trajectory, match_truth, relative_error
-from processing.pipeline import MATCHERS, Config, DrivenRun, drive_through, read_run
+from processing.pipeline import MATCHERS, DrivenRun, drive_through
+from processing.read_runs import read_runs
 from processing.relations import read_relations, relation_errors
 from processing.trajectory import run_trajectory
 from processing.tum import read_tum
@@ -28,7 +29,8 @@ SPACINGS_M = {
 
 def print_chains(recordings: list[Path], relations: Path | None = None) -> None:
     """All recordings in one row. Errors are those over 10 m and 100 m of driving, or of the relations."""
-    runs = [read_run((path,), None, Config("global"), None) for path in recordings]
+    one_job = Workers(1)
+    runs = [read_runs([path], None, with_tags=False, scratch=path.parent, work=one_job)[0] for path in recordings]
     measured = "mean error, m | °" if relations is not None else "RPE 10 m, m | RPE 100 m, m | RPE 100 m, °"
     header = f"| key frames | matcher | {measured} | key frames a metre | ms a scan |"
     print(f"{header}\n|{'---|' * (header.count('|') - 1)}")
@@ -38,8 +40,7 @@ def print_chains(recordings: list[Path], relations: Path | None = None) -> None:
                 continue
             processing.open_loop.KEYFRAME_SPACING_M = spacing_m
             began = time.process_time()
-            with Workers(1) as work:
-                driven = drive_through(runs, work, match)
+            driven = drive_through(runs, one_job, match)
             seconds = time.process_time() - began
             errors = _of_relations(driven[0], relations) if relations else _of_truth(driven, recordings)
             keyframes, scans = sum(len(of.loop.keyframes) for of in driven), sum(len(of.loop) for of in driven)

@@ -22,9 +22,10 @@ from processing.geometry import align, transform
 from processing.graph import build_graph
 from processing.open_loop import OpenLoop
 from processing.pieces import solve_piece
-from processing.pipeline import Config, drive_through, piece_input, read_run
+from processing.pipeline import drive_through, piece_input
 from processing.pose_graph import CORNER, Links, solve, squared_distances
 from processing.read_log import Run
+from processing.read_runs import read_runs
 from processing.relations import read_relations, relation_errors
 from processing.scan_matching import match_scans
 from processing.trajectory import run_trajectory
@@ -116,10 +117,10 @@ def _timed(solver: Callable[..., object], guess: np.ndarray, links: Links) -> tu
 
 def problem_of(recording: Path, relations: Path | None) -> Problem:
     """The links that the map of one recording ends with, the doubted ones among them."""
-    run = read_run((recording,), None, Config("global"), None)
-    with Workers(1) as work:
-        driven = drive_through([run], work, match_scans)
-    loop = driven[0].loop
+    one_job = Workers(1)
+    read = read_runs([recording], None, with_tags=False, scratch=recording.parent, work=one_job)
+    driven = drive_through(read, one_job, match_scans)
+    run, loop = driven[0].run, driven[0].loop
     graph = build_graph([[]], [len(loop)])
     dropped, processing.edge_map.DOUBTED = processing.edge_map.DOUBTED, 0.0
     (solved,) = solve_piece(piece_input("run-0", graph.pieces[0], driven), match_scans)
@@ -130,9 +131,9 @@ def problem_of(recording: Path, relations: Path | None) -> Problem:
     motions = links.motions.copy()
     motions[false] = motions[rng.choice(strong, len(false))]  # places that look like others
     if relations is not None:
-        error = partial(_relation_error, driven[0].run, loop, relations)
+        error = partial(_relation_error, run, loop, relations)
     else:
-        true = truth_at(*read_tum(recording.with_suffix(".tum")), run.run.scans.stamps_ns[loop.keyframes])
+        true = truth_at(*read_tum(recording.with_suffix(".tum")), run.scans.stamps_ns[loop.keyframes])
         error = partial(_absolute_error, true[:, :2])
     return Problem(loop.keyframe_poses, links, replace(links, motions=motions), error)
 
