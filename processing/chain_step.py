@@ -22,6 +22,13 @@ def join(a: Array, b: Array) -> Array:
 
 
 @njit(cache=True)
+def invert(pose: Array) -> Array:
+    """⊖ of a pose (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
+
+
+@njit(cache=True)
 def carry(pose: Array, covariance: Array, step: Array, noise: Array) -> tuple[Array, Array]:
     """A pose (3,) and its covariance (3, 3) after one more step (3,) with covariance `noise`."""
     c, s = math.cos(pose[2]), math.sin(pose[2])

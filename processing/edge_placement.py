@@ -186,7 +186,10 @@ def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, w
         (p, q) = overlap.numbers
         for (i, k), seen in zip(overlap.indices, found, strict=True):
             if worth_a_link(seen, LOOP_INLIERS):
-                ends.append((boundary.add(p, i), boundary.add(q, k)))
+                a, b = boundary.add(p, i), boundary.add(q, k)
+                if a == b:  # the pass that both begin with: nothing between
+                    continue
+                ends.append((a, b))
                 motions.append(seen.motion)
                 informations.append(np.linalg.inv(blur(seen.covariance)))
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)

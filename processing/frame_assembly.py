@@ -14,12 +14,20 @@ junction), links between their key frames join them; those key frames then belon
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU, splu
 
+from processing.block_cholesky import Pattern, factorise, find_pattern, solve_factors
 from processing.geometry import compose, inverse, relative, relative_jacobians, wrap_angle
-from processing.pose_graph import CORNER, Links, boundary_information, residuals, robust_weights, squared_distances
+from processing.pose_graph import (
+    CORNER,
+    Links,
+    NormalEquations,
+    boundary_information,
+    normal_equations,
+    robust_weights,
+    squared_distances,
+)
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,11 +43,6 @@ class Condensed:
     variables: Ints  # (b,)
     local: Array  # (b, 3) in the frame of the piece
     root: Array  # (3b - 3, 3b - 3) R: |R · error|² is the cost of the errors of poses 1 … b-1 seen from pose 0
-
-
-def factorise(matrix: sp.csc_matrix) -> SuperLU:
-    """Sparse factors of a symmetric positive definite matrix."""
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variables: Ints) -> Condensed:
@@ -80,6 +83,55 @@ class _Alike:
         others = np.einsum("gikc,gkcd->gikd", columns, j_b).reshape(count, size, -1)
         return np.concatenate([first, others], axis=2)
 
+    def add_to(self, equations: NormalEquations, pattern: Pattern, poses: Array) -> None:
+        """Add what they say to the normal equations."""
+        jacobians = self.jacobians(poses)
+        normal = np.swapaxes(jacobians, 1, 2) @ jacobians
+        gradient = np.einsum("gij,gi->gj", jacobians, self.errors(poses))
+        places = pattern.place[self.variables]
+        slots = pattern.slots(self.pairs.reshape(-1, 2)).reshape(len(places), -1)
+        _scatter(normal, gradient, places, slots, equations.diagonal, equations.below, equations.gradient)
+
+    @property
+    def pairs(self) -> Ints:
+        """(g, b (b - 1) / 2, 2) variables of one piece; the later one first."""
+        later, earlier = np.tril_indices(self.variables.shape[1], -1)
+        return np.stack([self.variables[:, later], self.variables[:, earlier]], axis=2)
+
+
+@njit(cache=True)
+def _scatter(
+    normal: Array,  # (g, 3b, 3b)
+    gradient: Array,  # (g, 3b)
+    places: Ints,  # (g, b) in the order of elimination; -1: fixed
+    slots: Ints,  # (g, b (b - 1) / 2)
+    diagonal: Array,
+    below: Array,
+    right: Array,
+) -> None:
+    for g in range(len(places)):
+        pair = -1
+        for k in range(places.shape[1]):
+            p = places[g, k]
+            for i in range(3 if p >= 0 else 0):
+                right[p, i] += gradient[g, 3 * k + i]
+                for j in range(3):
+                    diagonal[p, i, j] += normal[g, 3 * k + i, 3 * k + j]
+            for m in range(k):
+                pair += 1
+                q = places[g, m]
+                if p < 0 or q < 0:
+                    continue
+                high, low = (k, m) if p > q else (m, k)
+                for i in range(3):
+                    for j in range(3):
+                        value = normal[g, 3 * high + i, 3 * low + j]
+                        if p != q:
+                            below[slots[g, pair], i, j] += value
+                        else:  # a run that turned: one pass ends two of the piece's paths
+                            diagonal[p, i, j] += value
+                            diagonal[p, j, i] += value
+
 
 def _group(pieces: list[Condensed]) -> list[_Alike]:
     """Pieces by the number of their variables; what has only one says nothing."""
@@ -105,31 +157,21 @@ def solve_frames(
     agree, before any of them is doubted. `fixed` (V,): one variable of each connected part, at least.
     """
     poses, groups = first_guess, _group(pieces)
+    ends = np.concatenate([links.ends, *(group.pairs.reshape(-1, 2) for group in groups)])
+    pattern = find_pattern(len(poses), ends, fixed)
     for corner in GRADUAL if np.any(links.robust) else (CORNER,):
-        poses = _minimise(poses, groups, links, fixed, corner, max_iterations)
+        poses = _minimise(poses, groups, links, pattern, corner, max_iterations)
     return poses, robust_weights(squared_distances(poses, links), links.robust, CORNER)
 
 
 def _minimise(
-    first_guess: Array,
-    groups: list[_Alike],
-    links: Links,
-    fixed: NDArray[np.bool_],
-    corner: float,
-    max_iterations: int,
+    first_guess: Array, groups: list[_Alike], links: Links, pattern: Pattern, corner: float, max_iterations: int
 ) -> Array:
-    poses, free = first_guess.copy(), np.flatnonzero(np.repeat(~fixed, 3))
-    cost, damping = _cost(poses, groups, links, corner), 0.0
-    for _ in range(max_iterations if len(free) else 0):
-        jacobian, error = _linearise(poses, groups, links, corner)
-        jacobian = jacobian[:, free]
-        normal = (jacobian.T @ jacobian).tocsc()
-        normal = normal + damping * sp.diags(normal.diagonal()).tocsc()
-        tried = poses.copy()
-        tried.reshape(-1)[free] -= factorise(normal.tocsc()).solve(jacobian.T @ error)
-        tried[:, 2] = wrap_angle(tried[:, 2])
-        tried_cost = _cost(tried, groups, links, corner)
-        if tried_cost <= cost * (1 + 1e-9) + 1e-12:
+    poses, cost, damping = first_guess.copy(), _cost(first_guess, groups, links, corner), 0.0
+    for _ in range(max_iterations if len(pattern) else 0):
+        tried = _step(poses, groups, links, pattern, corner, damping)
+        tried_cost = np.inf if tried is None else _cost(tried, groups, links, corner)
+        if tried is not None and tried_cost <= cost * (1 + 1e-9) + 1e-12:
             settled = np.abs(relative(poses, tried)).max() < 1e-6
             poses, cost, damping = tried, tried_cost, damping / 10
             if settled:
@@ -141,41 +183,27 @@ def _minimise(
     return poses
 
 
+def _step(
+    poses: Array, groups: list[_Alike], links: Links, pattern: Pattern, corner: float, damping: float
+) -> Array | None:
+    """The poses after one step; None where the equations have no solution."""
+    weights = robust_weights(squared_distances(poses, links), links.robust, corner)
+    equations = normal_equations(poses, links, weights, pattern, pattern.slots(links.ends))
+    for group in groups:
+        group.add_to(equations, pattern, poses)
+    equations.diagonal[:, range(3), range(3)] *= 1 + damping
+    if not factorise(pattern, equations.diagonal, equations.below):
+        return None
+    moved = poses.copy()
+    moved[pattern.free] -= solve_factors(pattern, equations.diagonal, equations.below, equations.gradient)
+    moved[:, 2] = wrap_angle(moved[:, 2])
+    return moved
+
+
 def _cost(poses: Array, groups: list[_Alike], links: Links, corner: float) -> float:
     squares = squared_distances(poses, links)
     robust = np.where(links.robust, corner * squares / (corner + squares), squares).sum()
     return float(robust + sum(np.square(group.errors(poses)).sum() for group in groups))
-
-
-def _linearise(poses: Array, groups: list[_Alike], links: Links, corner: float) -> tuple[sp.csc_matrix, Array]:
-    """The whitened errors and their sparse Jacobian over all variables."""
-    rows, columns, values, errors, height = [], [], [], [np.zeros(0)], 0
-
-    def add(blocks: Array, variables: Ints, error: Array) -> None:
-        """Blocks (g, r, 3b) of variables (g, b), and their errors (g, r)."""
-        nonlocal height
-        row = height + np.arange(error.size).reshape(error.shape)
-        column = (3 * variables[..., None] + np.arange(3)).reshape(len(variables), -1)
-        rows.append(np.broadcast_to(row[:, :, None], blocks.shape).ravel())
-        columns.append(np.broadcast_to(column[:, None, :], blocks.shape).ravel())
-        values.append(blocks.ravel())
-        errors.append(error.ravel())
-        height += error.size
-
-    for group in groups:
-        add(group.jacobians(poses), group.variables, group.errors(poses))
-    if len(links):
-        weights = robust_weights(squared_distances(poses, links), links.robust, corner)
-        roots = np.sqrt(weights)[:, None, None] * np.swapaxes(np.linalg.cholesky(links.informations), 1, 2)
-        j_a, j_b = relative_jacobians(poses[links.ends[:, 0]], poses[links.ends[:, 1]])
-        error = np.einsum("mij,mj->mi", roots, residuals(poses, links))
-        add(np.concatenate([roots @ j_a, roots @ j_b], axis=2), links.ends, error)
-    entries = (np.concatenate([np.zeros(0), *values]), (_whole(rows), _whole(columns)))
-    return sp.csc_matrix(entries, shape=(height, 3 * len(poses))), np.concatenate(errors)
-
-
-def _whole(parts: list[Ints]) -> Ints:
-    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Array, Ints, list[Array]]:

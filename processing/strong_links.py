@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.chain_step import to_laser, to_vehicle
-from processing.geometry import inverse, relative
+from processing.chain_step import invert, to_laser, to_vehicle
+from processing.geometry import relative
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
@@ -102,7 +102,7 @@ def match_vehicles(
     match: Matcher,
 ) -> ScanMatch:
     """Match two scans; guess and result are motions of the vehicle."""
-    from_laser = inverse(mount)
+    from_laser = invert(mount)
     found = match(reference, current, to_laser(mount, from_laser, guess))
     motion, covariance = to_vehicle(mount, from_laser, found.motion, found.covariance)
     return replace(found, motion=motion, covariance=covariance)
@@ -125,14 +125,13 @@ def worth_a_link(found: ScanMatch, min_inliers: float) -> bool:
 
 def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float, between_drives: bool) -> Links:
     """The links that come of the pairs (p, 2): those whose scans match well and say something."""
-    ends, motions, informations = [], [], []
-    for i, j in pairs:
-        guess = relative(poses[i], poses[j])
-        reference, current = frames.scans[i], frames.scans[j]
-        found = match_vehicles(reference, current, guess, frames.mount, frames.match)
-        if not worth_a_link(found, min_inliers):
-            continue
-        ends.append((i, j))
-        motions.append(found.motion)
-        informations.append(np.linalg.inv(blur(found.covariance) if between_drives else found.covariance))
-    return Links.of(np.array(ends, np.int64), np.array(motions), np.array(informations), robust=True)
+    ends, motions, covariances = [], [], []
+    guesses = relative(poses[pairs[:, 0]], poses[pairs[:, 1]])
+    for (i, j), guess in zip(pairs.tolist(), guesses, strict=True):
+        found = match_vehicles(frames.scans[i], frames.scans[j], guess, frames.mount, frames.match)
+        if worth_a_link(found, min_inliers):
+            ends.append((i, j))
+            motions.append(found.motion)
+            covariances.append(blur(found.covariance) if between_drives else found.covariance)
+    informations = np.asarray(np.linalg.inv(np.array(covariances).reshape(-1, 3, 3)))
+    return Links.of(np.array(ends, np.int64), np.array(motions), informations, robust=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from processing.chain_step import carry, join, to_laser, to_vehicle
+from processing.chain_step import carry, invert, join, to_laser, to_vehicle
 from processing.geometry import compose, compose_jacobians, inverse, wrap_angle
 from processing.scan_match import through_mount
 
@@ -29,6 +29,7 @@ def test_poses_and_their_covariances_are_carried_on(rng: np.random.Generator) ->
     carried, grown = carry(pose, covariance, step, noise)
     assert_allclose(carried, compose(pose, step), atol=1e-12)
     assert_allclose(join(pose, step), compose(pose, step), atol=1e-12)
+    assert_allclose(invert(pose), inverse(pose), atol=1e-12)
     assert_allclose(grown, j_pose @ covariance @ j_pose.T + j_step @ noise @ j_step.T, atol=1e-12)
 
 
