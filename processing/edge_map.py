@@ -8,7 +8,6 @@ The piece grows along the drives: a stretch at a time is added, linked to what i
 guess for the next links is never worse than one stretch of open loop.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,6 @@ from processing.geometry import accumulate, relative
 from processing.pose_graph import CORNER, Links, Solution, solve
 from processing.relocation import NO_LINKS, relocate_stretch
 from processing.scan_matching import Matcher
-from processing.scan_walls import Scan
 from processing.strong_links import (
     HOP_INLIERS,
     LOOP_INLIERS,
@@ -28,6 +26,7 @@ from processing.strong_links import (
     loop_pairs,
     match_pairs,
 )
+from processing.sweeps import StoredScans
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,7 +48,7 @@ class Path:
 
     run_id: str
     keyframes: Ints  # (K,) their numbers in the run
-    scans: Sequence[Scan]  # K
+    scans: StoredScans  # K
     chain: Links  # K - 1 weak links, between (0, 1), (1, 2) …
     wheels: Links  # K - 1, odometry alone
     start: Array  # (3,) first guess of the first pose in the frame of the piece

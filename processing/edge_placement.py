@@ -24,6 +24,7 @@ from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
 from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
+from processing.sweeps import StoredScans
 from processing.workers import Workers
 
 Array = NDArray[np.float64]
@@ -119,7 +120,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
 
     def scan(variable: int) -> Scan:
         piece, index = seen_in[variable]
-        return piece.scan(index)
+        return piece.scan(index)[0]
 
     edges = [(variables[0], v) for variables in boundary.variables for v in variables]
     shape = (boundary.count, boundary.count)
@@ -142,17 +143,17 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
 class Overlap:
     """Key frames of two pieces that lie over each other, k pairs of them."""
 
-    pieces: tuple[SolvedPiece, SolvedPiece]
     numbers: tuple[int, int]  # of the pieces
+    mount: Array  # (3,) scanner in the vehicle
     indices: list[tuple[int, int]]  # k
+    scans: list[tuple[StoredScans, StoredScans]]  # k, one scan each
     guesses: list[Array]  # k of (3,): the second seen from the first
 
     def match(self, match: Matcher) -> list[ScanMatch]:
         """k matches, of the vehicle."""
-        p, q = self.pieces
         return [
-            match_vehicles(p.scan(i), q.scan(k), guess, q.input.mount, match)
-            for (i, k), guess in zip(self.indices, self.guesses, strict=True)
+            match_vehicles(one[0], other[0], guess, self.mount, match)
+            for (one, other), guess in zip(self.scans, self.guesses, strict=True)
         ]
 
 
@@ -167,12 +168,13 @@ def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[in
             if parts[p] != parts[q]:
                 continue
             distance, near = trees[p].query(poses[q][:, :2], distance_upper_bound=OVERLAP_M)
-            last, overlap = np.full(2, np.inf), Overlap((solved[p], solved[q]), (int(p), q), [], [])
+            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [])
             for k in np.flatnonzero(np.isfinite(distance)):
                 if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
                     continue
                 i, last = int(near[k]), poses[q][k, :2]
                 overlap.indices.append((i, int(k)))
+                overlap.scans.append((solved[p].scan(i), solved[q].scan(int(k))))
                 overlap.guesses.append(relative(poses[p][i], poses[q][k]))
             found += [overlap] * bool(overlap.indices)
     return found
@@ -183,7 +185,7 @@ def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, w
     ends, motions, informations = [], [], []
     matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps)
     for overlap, found in zip(overlaps, matches, strict=True):
-        (p, q) = overlap.numbers
+        p, q = overlap.numbers
         for (i, k), seen in zip(overlap.indices, found, strict=True):
             if worth_a_link(seen, LOOP_INLIERS):
                 a, b = boundary.add(p, i), boundary.add(q, k)

@@ -62,7 +62,7 @@ class OpenLoop:
         return len(self.reference)
 
     @property
-    def scans(self) -> Sequence[Scan]:
+    def scans(self) -> StoredScans:
         """K, of the key frames."""
         return StoredScans(self.sweeps, self.keyframes)
 

@@ -17,7 +17,6 @@ from processing.occupancy_grid import Grid, View, build_grid
 from processing.open_loop import OpenLoop
 from processing.registration import path_starts
 from processing.scan_matching import Matcher
-from processing.scan_walls import Scan
 from processing.sweeps import StoredScans, Sweeps
 
 Array = NDArray[np.float64]
@@ -50,10 +49,10 @@ class SolvedPiece:
     input: PieceInput
     map: PieceMap
 
-    def scan(self, index: int) -> Scan:
-        """Of one of the N key frames."""
+    def scan(self, index: int) -> StoredScans:
+        """That of one of the N key frames, alone."""
         p = int(np.searchsorted(self.map.firsts, index, side="right")) - 1
-        return self.input.paths[p].scans[index - int(self.map.firsts[p])]
+        return self.input.paths[p].scans.alone(index - int(self.map.firsts[p]))
 
     def ends(self, p: int) -> tuple[int, int]:
         """Indices of the first and last pose of path `p`."""

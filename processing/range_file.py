@@ -77,7 +77,7 @@ class RangeFile:
                 self._widen(beams)
             elif beams < self.beams:
                 ranges = np.hstack([ranges, np.full((rows, self.beams - beams), np.nan, np.float32)])
-            self._file.write(ranges.astype(np.float32, copy=False).tobytes())
+            self._file.write(np.ascontiguousarray(ranges, np.float32).data)
         except OSError as error:
             raise self._no_room(error) from error
         self.rows += rows

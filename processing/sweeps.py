@@ -110,6 +110,11 @@ class StoredScans(Sequence[Scan]):
     def __iter__(self) -> Iterator[Scan]:
         return self.sweeps.scans(self.rows)
 
+    def alone(self, which: int) -> "StoredScans":
+        """One of them, with nothing of the others."""
+        row = int(self.rows[which])
+        return StoredScans(self.sweeps.cut(row, row), np.zeros(1, np.int64))
+
 
 @njit(cache=True)
 def _straighten(
