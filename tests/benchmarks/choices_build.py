@@ -1,19 +1,21 @@
-"""`rtlog-atlas` with one choice made otherwise than it ships; what is no option of it is a constant of a module.
+"""Builds with one choice made otherwise than it ships; what is no option of `rtlog-atlas` is a constant of a module.
 
-    .venv/bin/python tests/benchmarks/choices_build.py "reference: the scan before" build RUN.mcap -o NAME.atlas
-
-In: the name of a choice, then the command's own arguments, with one job. Out: what the command does.
+In: recordings and a choice. Out: an atlas, and what it cost. Law: each build has a process of its own, a fork of this
+one: what is set there is set nowhere else, and what this one has compiled is there.
 """
 
+import multiprocessing
+import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processing.cli import main
+from processing.pipeline import Config, build
 from processing.pose_graph import Links, Solution, solve
 
 SPACING = "processing.open_loop.KEYFRAME_SPACING_M"
@@ -41,15 +43,15 @@ SQUARES = {"processing.frame_assembly.CORNER": NEVER, "processing.frame_assembly
 @dataclass(frozen=True)
 class Choice:
     name: str
-    options: tuple[str, ...] = ()
+    config: Config = field(default_factory=Config)
     constants: Mapping[str, object] = field(default_factory=dict)
 
 
 CHOICES = (
     Choice("as shipped"),
-    Choice("matcher: `psm`", ("--matcher", "psm")),
-    Choice("assembly: `paper`", ("--assembly", "paper")),
-    Choice("method: `global`", ("--method", "global")),
+    Choice("matcher: `psm`", Config(matcher="psm")),
+    Choice("assembly: `paper`", Config(assembly="paper")),
+    Choice("method: `global`", Config(method="global")),
     Choice("reference: the scan before", constants={SPACING: 0.0}),
     Choice("reference: key frames 0.25 m apart", constants={SPACING: 0.25}),
     Choice("reference: key frames 1.5 m apart", constants={SPACING: 1.5}),
@@ -59,15 +61,22 @@ CHOICES = (
 )
 
 
-def make(choice: Choice) -> None:
-    """Set the constants in this process. Raises: AttributeError: the product has no such constant any more."""
+def build_otherwise(choice: Choice, recordings: list[Path], atlas: Path) -> float:
+    """CPU seconds, user and system."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    process = multiprocessing.get_context("fork").Process(target=_build, args=(choice, recordings, atlas))
+    process.start()
+    process.join()
+    if process.exitcode:
+        sys.exit(f"{choice.name}: {atlas} was not built")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _build(choice: Choice, recordings: list[Path], atlas: Path) -> None:
     for name, value in choice.constants.items():
         module_name, constant = name.rsplit(".", 1)
         module = import_module(module_name)
-        getattr(module, constant)
+        getattr(module, constant)  # fails where the product has no such constant any more
         setattr(module, constant, value)
-
-
-if __name__ == "__main__":
-    make(next(choice for choice in CHOICES if choice.name == sys.argv[1]))
-    sys.exit(main(sys.argv[2:]))
+    build(recordings, None, choice.config, atlas)
