@@ -6,32 +6,27 @@ spurs lie at their node; a run without tags at its first pose. Unconnected parts
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from processing.boundary import Boundary, find_boundary
 from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
 from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
+from processing.overlaps import find_overlaps, link_overlaps
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links, Solution, solve
 from processing.registration import register_passes
-from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
-from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
-from processing.sweeps import StoredScans
 from processing.workers import Workers
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-OVERLAP_M = 2.5  # key frames of different pieces this close see the same walls
-OVERLAP_SPACING_M = 3.0
 OVERLAP_ROUNDS = 2
 PART_GAP_M = 20.0  # the range of the scanner, so that grids do not touch either
 
@@ -57,47 +52,6 @@ class Placement:
     nodes: Array  # (nodes, 3)
     node_parts: Ints  # (nodes,)
     remarks: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class Boundary:
-    """Which poses of the pieces are the same variable of the assembly: a pass ends one piece and begins the next."""
-
-    indices: list[list[int]]  # per piece: poses
-    variables: list[list[int]]  # per piece: their variables
-    passes: dict[tuple[int, int], int]  # (run, scan) → variable
-    nodes: dict[int, int]  # variable → node
-
-    @property
-    def count(self) -> int:
-        return 1 + max((v for piece in self.variables for v in piece), default=-1)
-
-    def add(self, piece: int, index: int) -> int:
-        """A variable for a pose within a piece, new or known."""
-        if index in self.indices[piece]:
-            return self.variables[piece][self.indices[piece].index(index)]
-        variable = self.count
-        self.indices[piece].append(index)
-        self.variables[piece].append(variable)
-        return variable
-
-
-def find_boundary(solved: list[SolvedPiece]) -> Boundary:
-    boundary = Boundary([[] for _ in solved], [[] for _ in solved], {}, {})
-    for p, piece in enumerate(solved):
-        for k, span in enumerate(piece.input.piece.spans):
-            for index, scan, node in zip(piece.ends(k), (span.first, span.last), (span.start, span.end), strict=True):
-                if node is None:
-                    continue
-                known = boundary.passes.get((span.run, scan))
-                variable = boundary.count if known is None else known
-                boundary.passes[span.run, scan] = variable
-                boundary.nodes[variable] = node
-                boundary.indices[p].append(index)
-                boundary.variables[p].append(variable)
-        if not boundary.indices[p]:
-            boundary.add(p, 0)
-    return boundary
 
 
 def condense_all(solved: list[SolvedPiece], boundary: Boundary, work: Workers) -> list[Condensed]:
@@ -126,9 +80,9 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     shape = (boundary.count, boundary.count)
     part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
     ends, motions, informations = [], [], []
-    for node in sorted(set(boundary.nodes.values())):
+    for passes in boundary.passes_of_nodes().values():
         linked: list[int] = []
-        for v in sorted(v for v, of in boundary.nodes.items() if of == node):
+        for v in passes:
             for u in [u for u in linked if part[u] != part[v]][:3]:
                 found = register_passes(scan(u), scan(v), solved[0].input.mount)
                 if found is not None:
@@ -136,64 +90,6 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
                     motions.append(found.motion)
                     informations.append(np.linalg.inv(found.covariance))
             linked.append(v)
-    return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
-
-
-@dataclass(frozen=True, slots=True)
-class Overlap:
-    """Key frames of two pieces that lie over each other, k pairs of them."""
-
-    numbers: tuple[int, int]  # of the pieces
-    mount: Array  # (3,) scanner in the vehicle
-    indices: list[tuple[int, int]]  # k
-    scans: list[tuple[StoredScans, StoredScans]]  # k, one scan each
-    guesses: list[Array]  # k of (3,): the second seen from the first
-
-    def match(self, match: Matcher) -> list[ScanMatch]:
-        """k matches, of the vehicle."""
-        return [
-            match_vehicles(one[0], other[0], guess, self.mount, match)
-            for (one, other), guess in zip(self.scans, self.guesses, strict=True)
-        ]
-
-
-def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int]) -> list[Overlap]:
-    poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
-    trees = [cKDTree(of[:, :2]) for of in poses]
-    low = np.array([of[:, :2].min(axis=0) for of in poses]) - OVERLAP_M
-    high = np.array([of[:, :2].max(axis=0) for of in poses])
-    found = []
-    for q in range(len(solved)):
-        for p in np.flatnonzero(np.all(low[:q] < high[q], axis=1) & np.all(low[q] < high[:q], axis=1)):
-            if parts[p] != parts[q]:
-                continue
-            distance, near = trees[p].query(poses[q][:, :2], distance_upper_bound=OVERLAP_M)
-            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [])
-            for k in np.flatnonzero(np.isfinite(distance)):
-                if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
-                    continue
-                i, last = int(near[k]), poses[q][k, :2]
-                overlap.indices.append((i, int(k)))
-                overlap.scans.append((solved[p].scan(i), solved[q].scan(int(k))))
-                overlap.guesses.append(relative(poses[p][i], poses[q][k]))
-            found += [overlap] * bool(overlap.indices)
-    return found
-
-
-def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers) -> Links:
-    """Links between the key frames of overlaps, which join the boundary."""
-    ends, motions, informations = [], [], []
-    matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps)
-    for overlap, found in zip(overlaps, matches, strict=True):
-        p, q = overlap.numbers
-        for (i, k), seen in zip(overlap.indices, found, strict=True):
-            if worth_a_link(seen, LOOP_INLIERS):
-                a, b = boundary.add(p, i), boundary.add(q, k)
-                if a == b:  # the pass that both begin with: nothing between
-                    continue
-                ends.append((a, b))
-                motions.append(seen.motion)
-                informations.append(np.linalg.inv(blur(seen.covariance)))
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 
@@ -257,8 +153,7 @@ def _settle(
     parts_of_nodes = np.full(len(graph.nodes), -1)
     nodes = np.zeros((len(graph.nodes), 3))
     part_of = {v: parts[p] for p, variables in enumerate(boundary.variables) for v in variables}
-    for node in range(len(graph.nodes)):
-        passes = [v for v, of in boundary.nodes.items() if of == node]
+    for node, passes in boundary.passes_of_nodes().items():
         homes = np.array([part_of[v] for v in passes])
         at = poses[np.array(passes)[homes == homes[0]]]
         nodes[node] = [*at[:, :2].mean(axis=0), at[0, 2]]

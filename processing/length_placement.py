@@ -11,7 +11,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processing.assembly import Assembly, assemble_paper, turn_from_headings
-from processing.edge_placement import Placed, Placement, find_boundary, lay_side_by_side, link_nodes, remark_parts
+from processing.boundary import find_boundary
+from processing.edge_placement import Placed, Placement, lay_side_by_side, link_nodes, remark_parts
 from processing.geometry import compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece

@@ -21,6 +21,7 @@ from processing.atlas import Atlas, write_atlas
 from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass
 from processing.calibration import WheelScale
+from processing.chain_step import join
 from processing.edge_files import edge_of, store_edge
 from processing.edge_placement import Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
@@ -85,6 +86,7 @@ def build(recordings: list[Path], profile: Profile | None, config: Config, outpu
         RTLogError: a disk is full, or a process died.
     """
     match = MATCHERS[config.matcher]
+    join(np.zeros(3), np.zeros(3))  # at its first kernel numba makes itself ready: here, rather than in every process
     with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as temporary:
         scratch = Path(temporary)
         read = read_runs(recordings, profile, config.method == "landmark", scratch, work)

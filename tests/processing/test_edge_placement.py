@@ -9,7 +9,8 @@ import pytest
 import shapely
 from numpy.testing import assert_allclose
 
-from processing.edge_placement import Placed, Placement, edge_frame, find_boundary, lay_side_by_side, place_by_frames
+from processing.boundary import find_boundary
+from processing.edge_placement import Placed, Placement, edge_frame, lay_side_by_side, place_by_frames
 from processing.geometry import compose, relative, transform, wrap_angle
 from processing.graph import Graph
 from processing.length_placement import place_by_lengths

@@ -1,0 +1,84 @@
+"""Overlaps: pieces that lie over each other without sharing a pass, joined by links between their key frames.
+
+In: solved pieces, and where the assembly has put their frames so far. Out: links, whose ends join the boundary.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from processing.boundary import Boundary
+from processing.geometry import compose, relative
+from processing.pieces import SolvedPiece
+from processing.pose_graph import Links
+from processing.scan_match import ScanMatch
+from processing.scan_matching import Matcher
+from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
+from processing.sweeps import StoredScans
+from processing.workers import Workers
+
+Array = NDArray[np.float64]
+
+OVERLAP_M = 2.5  # key frames of different pieces this close see the same walls
+OVERLAP_SPACING_M = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Key frames of two pieces that lie over each other, k pairs of them."""
+
+    numbers: tuple[int, int]  # of the pieces
+    mount: Array  # (3,) scanner in the vehicle
+    indices: list[tuple[int, int]]  # k
+    scans: list[tuple[StoredScans, StoredScans]]  # k, one scan each
+    guesses: list[Array]  # k of (3,): the second seen from the first
+
+    def match(self, match: Matcher) -> list[ScanMatch]:
+        """k matches, of the vehicle."""
+        return [
+            match_vehicles(one[0], other[0], guess, self.mount, match)
+            for (one, other), guess in zip(self.scans, self.guesses, strict=True)
+        ]
+
+
+def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int]) -> list[Overlap]:
+    poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
+    trees = [cKDTree(of[:, :2]) for of in poses]
+    low = np.array([of[:, :2].min(axis=0) for of in poses]) - OVERLAP_M
+    high = np.array([of[:, :2].max(axis=0) for of in poses])
+    found = []
+    for q in range(len(solved)):
+        for p in np.flatnonzero(np.all(low[:q] < high[q], axis=1) & np.all(low[q] < high[:q], axis=1)):
+            if parts[p] != parts[q]:
+                continue
+            distance, near = trees[p].query(poses[q][:, :2], distance_upper_bound=OVERLAP_M)
+            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [])
+            for k in np.flatnonzero(np.isfinite(distance)):
+                if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
+                    continue
+                i, last = int(near[k]), poses[q][k, :2]
+                overlap.indices.append((i, int(k)))
+                overlap.scans.append((solved[p].scan(i), solved[q].scan(int(k))))
+                overlap.guesses.append(relative(poses[p][i], poses[q][k]))
+            found += [overlap] * bool(overlap.indices)
+    return found
+
+
+def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers) -> Links:
+    """Links between the key frames of overlaps, which join the boundary."""
+    ends, motions, informations = [], [], []
+    matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps)
+    for overlap, found in zip(overlaps, matches, strict=True):
+        p, q = overlap.numbers
+        for (i, k), seen in zip(overlap.indices, found, strict=True):
+            if worth_a_link(seen, LOOP_INLIERS):
+                a, b = boundary.add(p, i), boundary.add(q, k)
+                if a == b:  # the pass that both begin with: nothing between
+                    continue
+                ends.append((a, b))
+                motions.append(seen.motion)
+                informations.append(np.linalg.inv(blur(seen.covariance)))
+    return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
