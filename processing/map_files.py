@@ -80,10 +80,17 @@ class Overlay:
 
 def to_image(grid: Grid) -> MapImage:
     """The grid in three values."""
-    pixels = np.full(grid.log_odds.shape, UNKNOWN, dtype=np.uint8)
-    pixels[grid.log_odds > OCCUPIED_ABOVE] = OCCUPIED
-    pixels[grid.log_odds < FREE_BELOW] = FREE
+    pixels = np.empty(grid.cells.shape, dtype=np.uint8)
+    _classify(grid.cells, grid.unit, pixels)
     return MapImage(pixels, grid.resolution_m, grid.origin)
+
+
+@numba.njit(cache=True)
+def _classify(cells: NDArray[np.float32 | np.int8], unit: np.float32, pixels: NDArray[np.uint8]) -> None:
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            log_odds = cells[row, column] * unit
+            pixels[row, column] = OCCUPIED if log_odds > OCCUPIED_ABOVE else FREE if log_odds < FREE_BELOW else UNKNOWN
 
 
 def stitch_image(grids: Sequence[Grid | StoredGrid], placements: Array, path: Path, work: Workers) -> StoredImage:
@@ -115,7 +122,7 @@ def stitch_band(
     with path.open("r+b") as file:
         file.seek(rows.start * window.shape[1])
         file.write(to_image(band).pixels.data)
-    known = band.log_odds != 0
+    known = band.cells != 0
     return known.any(axis=1), known.any(axis=0)
 
 

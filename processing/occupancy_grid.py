@@ -55,7 +55,7 @@ class Grid:
 
     @property
     def log_odds(self) -> NDArray[np.float32]:
-        return self.cells * self.unit
+        return self.cells * self.unit if self.unit != ONE else np.asarray(self.cells, np.float32)
 
     @property
     def window(self) -> Window:
