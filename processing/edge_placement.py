@@ -16,6 +16,7 @@ from processing.boundary import Boundary, find_boundary
 from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
 from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
+from processing.linked_paths import TAG_INFORMATION, TagJoin, join_groups, merge_groups, split_groups
 from processing.overlaps import find_overlaps, link_overlaps
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links, Solution, solve
@@ -93,6 +94,13 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 
+def link_tags(joins: list[TagJoin], boundary: Boundary) -> Links:
+    """Links of what tags alone say of groups of paths; their poses are passes, so they are in the boundary."""
+    ends = [tuple(boundary.add(g, index) for g, index in zip(of.groups, of.indices, strict=True)) for of in joins]
+    informations = np.tile(TAG_INFORMATION, (len(joins), 1, 1))
+    return Links.of(np.array(ends), np.array([of.motion for of in joins]), informations, robust=False)
+
+
 def bend(
     solved: list[SolvedPiece], boundary: Boundary, poses: Array, frames: list[Array], work: Workers
 ) -> list[SolvedPiece]:
@@ -111,25 +119,30 @@ def bend(
 
 def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers) -> Placement:
     """The refined assembly: least squares of all that the pieces know of each other, then the pieces bent to fit."""
-    boundary = find_boundary(solved)
-    condensed = condense_all(solved, boundary, work)
-    links = link_nodes(solved, boundary)
+    groups = split_groups(solved)
+    pieces = [group.solved for group in groups]
+    boundary = find_boundary(pieces)
+    condensed = condense_all(pieces, boundary, work)
+    links = link_nodes(pieces, boundary) + link_tags(join_groups(groups), boundary)
     poses, part, frames = lay_out(condensed, links, boundary.count)
     poses, _ = solve_frames(poses, condensed, links, _first_of_each(part))
     frames = [fit_frame(piece, poses) for piece in condensed]
     parts = [int(part[piece.variables[0]]) for piece in condensed]
     for _ in range(OVERLAP_ROUNDS):
-        grown = find_boundary(solved)
-        more = links + link_overlaps(find_overlaps(solved, frames, parts), grown, match, work)
-        condensed = condense_all(solved, grown, work)
+        grown = find_boundary(pieces)
+        more = links + link_overlaps(find_overlaps(pieces, frames, parts), grown, match, work)
+        condensed = condense_all(pieces, grown, work)
         poses, part, _ = lay_out(condensed, more, grown.count)
         poses, weights = solve_frames(poses, condensed, more, _first_of_each(part))
         frames, boundary = [fit_frame(piece, poses) for piece in condensed], grown
         parts = [int(part[piece.variables[0]]) for piece in condensed]
-    bent = bend(solved, boundary, poses, frames, work)
+    bent = bend(pieces, boundary, poses, frames, work)
     doubted = int((weights < 0.1).sum())
     notes = [f"{doubted} of {len(more)} links between pieces contradict the rest and were left out"] if doubted else []
-    return _settle(bent, parts, boundary, poses, graph, notes)
+    homes = {v: part for variables, part in zip(boundary.variables, parts, strict=True) for v in variables}
+    of_pieces = dict(reversed([(group.piece, part) for group, part in zip(groups, parts, strict=True)]))
+    merged = merge_groups(solved, groups, bent)
+    return _settle(merged, [of_pieces[p] for p in range(len(solved))], boundary, homes, poses, graph, notes)
 
 
 def fit_frame(piece: Condensed, poses: Array) -> Array:
@@ -147,14 +160,29 @@ def _first_of_each(part: Ints) -> NDArray[np.bool_]:
 
 
 def _settle(
-    bent: list[SolvedPiece], parts: list[int], boundary: Boundary, poses: Array, graph: Graph, notes: list[str]
+    bent: list[SolvedPiece],
+    parts: list[int],
+    boundary: Boundary,
+    homes_of: dict[int, int],
+    poses: Array,
+    graph: Graph,
+    notes: list[str],
 ) -> Placement:
-    """Nodes where their passes are on average; parts side by side; the pieces in their own frames."""
+    """Nodes where their passes are on average; parts side by side; the pieces in their own frames.
+
+    Args:
+        bent: In the frame of their part.
+        parts: Of the pieces.
+        boundary: Its passes make the nodes.
+        homes_of: The part of each variable of the boundary.
+        poses: (V, 3) of those variables.
+        graph: Its nodes are placed.
+        notes: What is to be told so far.
+    """
     parts_of_nodes = np.full(len(graph.nodes), -1)
     nodes = np.zeros((len(graph.nodes), 3))
-    part_of = {v: parts[p] for p, variables in enumerate(boundary.variables) for v in variables}
     for node, passes in boundary.passes_of_nodes().items():
-        homes = np.array([part_of[v] for v in passes])
+        homes = np.array([homes_of[v] for v in passes])
         at = poses[np.array(passes)[homes == homes[0]]]
         nodes[node] = [*at[:, :2].mean(axis=0), at[0, 2]]
         parts_of_nodes[node] = homes[0]

@@ -12,6 +12,8 @@ junction), links between their key frames join them; those key frames then belon
 """
 
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
 
 import numpy as np
 from numba import njit
@@ -219,19 +221,20 @@ def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Arra
     for p, piece in enumerate(pieces):
         for v in piece.variables:
             members[v].append(p)
-    joined: list[list[tuple[int, Array]]] = [[] for _ in range(variables)]
-    for (a, b), motion in zip(links.ends, links.motions, strict=True):
-        joined[a].append((int(b), motion))
-        joined[b].append((int(a), inverse(motion)))
-    parts = 0
+    joined: list[list[tuple[float, int, Array]]] = [[] for _ in range(variables)]
+    doubts = np.trace(np.linalg.inv(links.informations), axis1=1, axis2=2)
+    for (a, b), motion, doubt in zip(links.ends, links.motions, doubts.tolist(), strict=True):
+        joined[a].append((doubt, int(b), motion))
+        joined[b].append((doubt, int(a), inverse(motion)))
+    parts, found = 0, count()
     for root in range(len(pieces)):
         if frames[root] is not None:
             continue
         frames[root], waiting = np.zeros(3), [root]
-        bridges: list[tuple[int, Array]] = []
+        bridges: list[tuple[float, int, int, Array]] = []  # a heap: the surest first, then the first that was found
         while waiting or bridges:
             if not waiting:  # all that shares passes is placed; now what only a link joins
-                v, pose = bridges.pop(0)
+                _, _, v, pose = heappop(bridges)
                 if part[v] >= 0:
                     continue
                 poses[v], part[v] = pose, parts
@@ -244,7 +247,9 @@ def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Arra
                 if part[v] >= 0:
                     continue
                 poses[v], part[v] = compose(frame, at), parts
-                bridges += [(other, compose(poses[v], motion)) for other, motion in joined[v] if part[other] < 0]
+                for doubt, to, motion in joined[v]:
+                    if part[to] < 0:
+                        heappush(bridges, (doubt, next(found), to, compose(poses[v], motion)))
                 waiting += _join_pieces(v, poses[v], pieces, members[v], frames)
         parts += 1
     return poses, part, [frame for frame in frames if frame is not None]

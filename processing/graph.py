@@ -13,7 +13,7 @@ which of them lie in the same drift. A run without any tag is a piece of its own
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 from processing.beacons import Pass
@@ -30,6 +30,9 @@ class Span:
     last: int
     start: int | None  # node at the first scan
     end: int | None  # node at the last scan
+    reaches_m: tuple[float, float] = field(
+        default=(0.0, 0.0), compare=False
+    )  # how far the tags of these nodes are read
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +60,15 @@ def build_graph(passes: Sequence[Sequence[Pass]], scan_counts: Sequence[int]) ->
     """One list of passes and one number of scans a run."""
     epcs = sorted({found.epc for run in passes for found in run})
     number = {epc: k for k, epc in enumerate(epcs)}
+    reaches_m = [0.0] * len(epcs)
+    for single in (single for found in passes for single in found):
+        reaches_m[number[single.epc]] = max(reaches_m[number[single.epc]], single.range_m)
     visits: list[list[tuple[int, Pass]]] = [[] for _ in epcs]
     spans: dict[tuple[int, int, int, int], list[Span]] = {}
     for run, (found, count) in enumerate(zip(passes, scan_counts, strict=True)):
         for single in found:
             visits[number[single.epc]].append((run, single))
-        for span in _cut(run, found, count, number):
+        for span in _cut(run, found, count, number, reaches_m):
             spans.setdefault(_key(span), []).append(span)
     nodes = tuple(Node(epc, tuple(of)) for epc, of in zip(epcs, visits, strict=True))
     pieces = []
@@ -71,12 +77,22 @@ def build_graph(passes: Sequence[Sequence[Pass]], scan_counts: Sequence[int]) ->
     return Graph(nodes, tuple(pieces))
 
 
-def _cut(run: int, passes: Sequence[Pass], count: int, number: dict[str, int]) -> list[Span]:
+def _cut(
+    run: int, passes: Sequence[Pass], count: int, number: dict[str, int], reaches_m: Sequence[float]
+) -> list[Span]:
     """The spans of a run, cut at the centres of its passes."""
     cuts: list[tuple[int, int | None]] = [(0, None)]
     cuts += [(found.centre, number[found.epc]) for found in passes]
     cuts += [(count - 1, None)]
-    return [Span(run, first, last, start, end) for (first, start), (last, end) in pairwise(cuts) if last > first]
+
+    def reach_m(node: int | None) -> float:
+        return 0.0 if node is None else reaches_m[node]
+
+    return [
+        Span(run, first, last, start, end, (reach_m(start), reach_m(end)))
+        for (first, start), (last, end) in pairwise(cuts)
+        if last > first
+    ]
 
 
 def _key(span: Span) -> tuple[int, int, int, int]:

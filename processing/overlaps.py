@@ -14,9 +14,10 @@ from processing.boundary import Boundary
 from processing.geometry import compose, relative
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links
+from processing.registration import find_near, is_open
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
-from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, worth_a_link
+from processing.strong_links import LOOP_INLIERS, blur, match_vehicles, viewpoints, worth_a_link
 from processing.sweeps import StoredScans
 from processing.workers import Workers
 
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 
 OVERLAP_M = 2.5  # key frames of different pieces this close see the same walls
 OVERLAP_SPACING_M = 3.0
+SEARCHES = 4  # key frames of an overlap whose match may be metres off
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,24 +39,30 @@ class Overlap:
     guesses: list[Array]  # k of (3,): the second seen from the first
 
     def match(self, match: Matcher) -> list[ScanMatch]:
-        """k matches, of the vehicle."""
-        return [
+        """k matches, of the vehicle; where none says in all directions how the pieces lie, some are searched for."""
+        found = [
             match_vehicles(one[0], other[0], guess, self.mount, match)
             for (one, other), guess in zip(self.scans, self.guesses, strict=True)
         ]
+        if not any(worth_a_link(of, LOOP_INLIERS) and not is_open(of) for of in found):
+            for n in np.unique(np.linspace(0, len(found) - 1, SEARCHES).round().astype(int)).tolist():
+                one, other = self.scans[n]
+                found[n] = find_near(one[0], other[0], self.guesses[n], self.mount) or found[n]
+        return found
 
 
 def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int]) -> list[Overlap]:
     poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
-    trees = [cKDTree(of[:, :2]) for of in poses]
-    low = np.array([of[:, :2].min(axis=0) for of in poses]) - OVERLAP_M
-    high = np.array([of[:, :2].max(axis=0) for of in poses])
+    views = [viewpoints(of, piece.input.mount) for of, piece in zip(poses, solved, strict=True)]
+    trees = [cKDTree(of) for of in views]
+    low = np.array([of.min(axis=0) for of in views]) - OVERLAP_M
+    high = np.array([of.max(axis=0) for of in views])
     found = []
     for q in range(len(solved)):
         for p in np.flatnonzero(np.all(low[:q] < high[q], axis=1) & np.all(low[q] < high[:q], axis=1)):
             if parts[p] != parts[q]:
                 continue
-            distance, near = trees[p].query(poses[q][:, :2], distance_upper_bound=OVERLAP_M)
+            distance, near = trees[p].query(views[q], distance_upper_bound=OVERLAP_M)
             last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [])
             for k in np.flatnonzero(np.isfinite(distance)):
                 if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:

@@ -79,6 +79,7 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
         chains=[path.chain for path in given.paths],
         scans=[path.scans for path in given.paths],
         ends=[(span.start, span.end) for span in given.piece.spans],
+        reaches_m=[span.reaches_m for span in given.piece.spans],
         mount=given.mount,
     )
     out = []

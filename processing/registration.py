@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.geometry import accumulate, compose, inverse
+from processing.geometry import accumulate, compose, inverse, wrap_angle
 from processing.match_search import agreement, search_match
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
 from processing.scan_matching import CLOSEST_M, match_scans
 from processing.scan_walls import Scan
+from processing.strong_links import extreme_variances
 
 Array = NDArray[np.float64]
 
@@ -27,40 +28,68 @@ MIN_WORTH = 0.1  # by agreement: one pair of different places in twenty has as m
 SEEN_M = 0.5  # standard deviation of a motion that the walls tell in every direction
 CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks the same both ways
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
+QUARTERS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 
 
-def pass_hypotheses(reference: Scan, current: Scan, mount: Array) -> list[ScanMatch]:
-    """Motions of the vehicle from one pass of a tag to another, facing the same way and the other; the better first."""
-    return [match for _, match in _weigh_headings(reference, current, mount)]
+def is_open(match: ScanMatch) -> bool:
+    """Do the walls leave some direction of the motion open?"""
+    return extreme_variances(match.covariance)[1] > SEEN_M**2
+
+
+def pass_hypotheses(
+    reference: Scan, current: Scan, mount: Array, headings: Sequence[float] = (0.0, np.pi)
+) -> list[ScanMatch]:
+    """Motions of the vehicle from one pass of a tag to another, one for each heading that fits; the better first."""
+    return [match for _, match in _weigh_headings(reference, current, mount, headings)]
 
 
 def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
-    """The motion from one pass to another; None where the scans do not tell it, or not which way the vehicle faced."""
-    found = _weigh_headings(reference, current, mount)
-    if not found or (len(found) > 1 and found[0][0] - found[1][0] < CLEARLY_BETTER):
+    """The motion from one pass to another; None where the scans do not tell all of it, or not which way the vehicle
+    faced: between smooth walls a drift looks like the next.
+    """
+    found = _weigh_headings(reference, current, mount, QUARTERS)
+    if not found or is_open(found[0][1]):
         return None
-    return found[0][1]
+    worth, best = found[0]
+    others = [other for other, match in found if abs(wrap_angle(match.motion[2] - best.motion[2])) > SEARCH_RAD]
+    return best if not others or worth - others[0] >= CLEARLY_BETTER else None
 
 
-def _weigh_headings(reference: Scan, current: Scan, mount: Array) -> list[tuple[float, ScanMatch]]:
-    found: list[tuple[float, ScanMatch]] = []
-    for heading in (0.0, np.pi):
-        guess = compose(inverse(mount), compose(np.array([0.0, 0.0, heading]), mount))
-        match = search_match(reference, current, guess, SEARCH_M, SEARCH_RAD)
-        if match.converged and match.inliers >= MIN_INLIERS:
-            motion, covariance = through_mount(mount, match.motion, match.covariance)
-            # What the other scan should have seen counts as well: one step from there looks without going anywhere.
-            back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
-            worth = min(agreement(match), agreement(back))
-            if worth > MIN_WORTH:
-                found.append((worth, replace(match, motion=motion, covariance=covariance)))
+def _weigh_headings(
+    reference: Scan, current: Scan, mount: Array, headings: Sequence[float]
+) -> list[tuple[float, ScanMatch]]:
+    guesses = [np.array([0.0, 0.0, heading]) for heading in headings]
+    found = [of for guess in guesses if (of := _search_around(reference, current, guess, mount)) is not None]
     return sorted(found, key=lambda of: of[0], reverse=True)
+
+
+def _search_around(reference: Scan, current: Scan, guess: Array, mount: Array) -> tuple[float, ScanMatch] | None:
+    """The best match around a guess, of the vehicle, and its worth."""
+    match = search_match(reference, current, compose(inverse(mount), compose(guess, mount)), SEARCH_M, SEARCH_RAD)
+    if not (match.converged and match.inliers >= MIN_INLIERS):
+        return None
+    # What the other scan should have seen counts as well: one step from there looks without going anywhere.
+    back = match_scans(current, reference, inverse(match.motion), reach_m=CLOSEST_M, max_iterations=1)
+    worth = min(agreement(match), agreement(back))
+    if worth <= MIN_WORTH:
+        return None
+    motion, covariance = through_mount(mount, match.motion, match.covariance)
+    return worth, replace(match, motion=motion, covariance=covariance)
+
+
+def find_near(reference: Scan, current: Scan, guess: Array, mount: Array) -> ScanMatch | None:
+    """The motion of the vehicle from one scan to another, by a guess (3,) that is metres off; None where they do not
+    tell all of it.
+    """
+    found = _search_around(reference, current, guess, mount)
+    return None if found is None or is_open(found[1]) else found[1]
 
 
 def path_starts(
     chains: list[Links],  # per path
     scans: list[Sequence[Scan]],  # per path
     ends: list[tuple[int | None, int | None]],  # nodes at the first and last key frame of each path
+    reaches_m: list[tuple[float, float]],  # how far the tags there are read
     mount: Array,
 ) -> tuple[list[Array], list[int]]:
     """The start of each path (3,) in the frame of the first path of its group, and each path's group.
@@ -72,8 +101,7 @@ def path_starts(
     groups: list[int] = []
     for p in range(len(chains)):
         for leader in dict.fromkeys(groups):
-            candidates = _places(leader, p, poses, scans, ends, mount)
-            placed = next((at for at in candidates if lies_along(poses[leader], compose(at, poses[p]))), None)
+            placed = _place_beside(leader, p, poses, scans, ends, reaches_m, mount)
             if placed is not None:
                 groups.append(leader)
                 starts.append(placed)
@@ -84,37 +112,68 @@ def path_starts(
     return starts, groups
 
 
-def _places(
+def _place_beside(
     a: int,
     b: int,
     poses: list[Array],
     scans: list[Sequence[Scan]],
     ends: list[tuple[int | None, int | None]],
+    reaches_m: list[tuple[float, float]],
     mount: Array,
-) -> list[Array]:
-    """Starts of path `b` in the frame of path `a`, through a node that both touch: the likeliest first."""
+) -> Array | None:
+    """The start of path `b` in the frame of path `a`, by the nodes that both touch; None: they lie in different drifts,
+    or nothing tells how they lie to each other.
+    """
     shared = [
         (end_a, end_b)
         for end_a in (0, -1)
         for end_b in (0, -1)
         if ends[a][end_a] is not None and ends[a][end_a] == ends[b][end_b]
     ]
-    hypotheses = [
-        (found, compose(compose(poses[a][end_a], found.motion), inverse(poses[b][end_b])))
-        for end_a, end_b in shared
-        for found in pass_hypotheses(scans[a][end_a], scans[b][end_b], mount)
-    ]
+    jitter_m = [max(SAME_DRIFT_M, reaches_m[a][of]) for of, _ in shared]
+    turn = _turn_by_tags(poses[a][[of for of, _ in shared]], poses[b][[of for _, of in shared]], sum(jitter_m))
+    places: list[tuple[bool, Array]] = []
+    for end_a, end_b in shared:
+        one, other = scans[a][end_a], scans[b][end_b]
+        if turn is None:  # the tags lie together: nothing but clear scans says how the paths lie
+            clear = register_passes(one, other, mount)
+            found = [clear] if clear is not None else []
+        else:
+            by_tags = turn + poses[b][end_b][2] - poses[a][end_a][2]
+            found = pass_hypotheses(one, other, mount, (0.0, np.pi, float(by_tags)))
+        for match in found:
+            start = compose(compose(poses[a][end_a], match.motion), inverse(poses[b][end_b]))
+            places.append((is_open(match), start))
     # An end where the scans see the motion along the drift too says more than one between smooth walls.
-    hypotheses.sort(key=lambda of: bool(np.linalg.eigvalsh(of[0].covariance[:2, :2])[-1] > SEEN_M**2))
-    places = [start for _, start in hypotheses]
-    # Where no scan tells, the tags coincide; of both headings, the one that brings the paths closer together.
-    tree = cKDTree(poses[a][:, :2])
-    blind = [
-        compose(compose(poses[a][end_a], np.array([0.0, 0.0, heading])), inverse(poses[b][end_b]))
-        for end_a, end_b in shared
-        for heading in (0.0, np.pi)
-    ]
-    return places + sorted(blind, key=lambda start: float(tree.query(compose(start, poses[b])[:, :2])[0].mean()))
+    places.sort(key=lambda of: of[0])
+    if turn is not None:  # where no scan tells, the tags coincide
+        at = np.array([0.0, 0.0, turn])
+        places += [(True, _shifted(at, poses[a][of], compose(at, poses[b][to]))) for of, to in shared]
+    drift_m = SAME_DRIFT_SHARE * float(np.hypot(*np.diff(poses[b][:, :2], axis=0).T).sum())
+    for _, start in places:
+        there = compose(start, poses[b])
+        apart_m = [float(np.hypot(*(there[to] - poses[a][of])[:2])) for of, to in shared]
+        meet = all(apart < most + drift_m for apart, most in zip(apart_m, jitter_m, strict=True))
+        if meet and lies_along(poses[a], there):
+            return start
+    return None
+
+
+def _turn_by_tags(one: Array, other: Array, jitter_m: float) -> float | None:
+    """By how much the second path's frame is turned in the first's, from where each passes (k, 3) the same tags; None
+    where these lie no further apart than passes of one tag may.
+    """
+    if len(one) < 2:
+        return None
+    chords = np.array([one[-1, :2] - one[0, :2], other[-1, :2] - other[0, :2]])
+    if np.hypot(*chords.T).min() < jitter_m:
+        return None
+    return float(wrap_angle(np.subtract(*np.arctan2(chords[:, 1], chords[:, 0]))))
+
+
+def _shifted(start: Array, reference: Array, pose: Array) -> Array:
+    """The start moved, unturned, so that `pose` comes to lie on the reference."""
+    return start + np.array([*(reference - pose)[:2], 0.0])
 
 
 def lies_along(reference: Array, poses: Array) -> bool:

@@ -15,7 +15,7 @@ from processing.geometry import compose, inverse, relative, transform, wrap_angl
 from processing.match_search import score
 from processing.pose_graph import Links
 from processing.scan_walls import Scan
-from processing.strong_links import KeyFrames, blur, match_vehicles
+from processing.strong_links import KeyFrames, blur, match_vehicles, viewpoints
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,7 +86,8 @@ def relocate_stretch(
         place, share = relocate(frames.scans[k], field, origin, poses[k], frames.mount, radius_m, radius_rad)
         if share < MIN_SHARE:
             continue
-        order = np.argsort(np.hypot(*(poses[known, :2] - place[:2]).T), kind="stable")
+        off = viewpoints(poses[known], frames.mount) - viewpoints(place[None], frames.mount)
+        order = np.argsort(np.hypot(*off.T), kind="stable")
         tried = []
         for near in known[order[:NEIGHBOURS]]:
             guess = relative(poses[near], place)

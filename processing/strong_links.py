@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from processing.chain_step import invert, to_laser, to_vehicle
-from processing.geometry import relative
+from processing.geometry import compose, relative
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher
@@ -34,6 +34,7 @@ LOOP_INLIERS = 0.6
 UNSEEN_M = 1.0  # a motion known no better than this was not seen
 TILT_M, TILT_RAD = 0.02, 0.02
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
+VIEW_M = 2.0  # so far before the scanner is the middle of what it sees of a drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +61,23 @@ def hop_pairs(frames: KeyFrames) -> Ints:
     return np.unique(np.concatenate(pairs), axis=0) if pairs else np.empty((0, 2), np.int64)
 
 
+def viewpoints(poses: Array, mount: Array) -> Array:
+    """What key frames look at (n, 2): VIEW_M before their scanners. Those that drove the same way see the same walls
+    where they stand side by side, those that drove opposite ways where their scanners face each other.
+    """
+    return np.asarray(compose(compose(poses, mount), np.array([VIEW_M, 0.0, 0.0]))[:, :2])
+
+
 def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: float) -> Ints:
-    """Pairs (p, 2) of a new key frame and the nearest old one on every stretch of drive within the radius."""
+    """Pairs (p, 2) of a new key frame and the old one with the nearest view on every stretch of drive within the
+    radius.
+    """
     if len(old) == 0 or len(new) == 0:
         return np.empty((0, 2), np.int64)
-    tree = cKDTree(poses[old, :2])
+    views = viewpoints(poses, frames.mount)
+    tree = cKDTree(views[old])
     pairs = []
-    for i, near in zip(new, tree.query_ball_point(poses[new, :2], radius_m), strict=True):
+    for i, near in zip(new, tree.query_ball_point(views[new], radius_m), strict=True):
         candidates = old[np.array(sorted(near), np.int64)]
         same = frames.drive[candidates] == frames.drive[i]
         apart = np.abs(frames.travelled[candidates] - frames.travelled[i]) > LOOP_SPACING_M
@@ -75,7 +86,7 @@ def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: 
             continue
         breaks = (np.diff(candidates) > 3) | (np.diff(frames.drive[candidates]) != 0)
         for stretch in np.split(candidates, np.flatnonzero(breaks) + 1):
-            pairs.append((nearest(poses, stretch, i), i))
+            pairs.append((nearest(views, stretch, i), i))
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
@@ -90,8 +101,8 @@ def blur(covariance: Array) -> Array:
     return covariance + np.diag([TILT_M**2, TILT_M**2, TILT_RAD**2])
 
 
-def nearest(poses: Array, candidates: Ints, i: int) -> int:
-    return int(candidates[np.argmin(np.hypot(*(poses[candidates, :2] - poses[i, :2]).T))])
+def nearest(points: Array, candidates: Ints, i: int) -> int:
+    return int(candidates[np.argmin(np.hypot(*(points[candidates] - points[i]).T))])
 
 
 def match_vehicles(

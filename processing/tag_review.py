@@ -15,7 +15,7 @@ from processing.edge_placement import Placement
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
 from processing.open_loop import mount_pose
-from processing.registration import SEEN_M, register_passes
+from processing.registration import register_passes
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
 from processing.trajectory import keyframe_poses
@@ -39,8 +39,7 @@ def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[di
 
     @cache
     def same_walls(first: PassId, second: PassId) -> bool:
-        found = register_passes(scan_of(first), scan_of(second), mount_pose(staying[first[0]].run))
-        return found is not None and bool(np.linalg.eigvalsh(found.covariance[:2, :2])[-1] < SEEN_M**2)
+        return register_passes(scan_of(first), scan_of(second), mount_pose(staying[first[0]].run)) is not None
 
     moved = find_moved([_open_passes(run) for run in staying], same_walls)
     reasons = dict.fromkeys(riding, RIDES) | dict.fromkeys(moved, MOVED)

@@ -136,7 +136,9 @@ def test_two_drifts_between_the_same_tags_become_two_pieces(driven: list[DrivenR
 def test_a_stray_path_without_a_common_tag_is_a_group_of_its_own(driven: list[DrivenRun]) -> None:
     loop = driven[0].loop
     chain, scans = loop.links[np.arange(20)], loop.scans[:21]
-    starts, groups = path_starts([chain] * 3, [scans] * 3, [(0, 1), (2, 3), (0, 1)], mount_pose(driven[0].run))
+    starts, groups = path_starts(
+        [chain] * 3, [scans] * 3, [(0, 1), (2, 3), (0, 1)], [(0.0, 0.0)] * 3, mount_pose(driven[0].run)
+    )
     assert groups == [0, 1, 0]
     assert np.all(starts[0] == 0)
     assert np.all(starts[1] == 0)
@@ -151,6 +153,6 @@ def test_where_no_scan_tells_the_tags_coincide(driven: list[DrivenRun]) -> None:
     back = backwards(there)
     chain_back = replace(chain, motions=relative(back[:-1], back[1:]))
     blind = [prepare_scan(np.full_like(scan.points, np.nan), scan.angle_min, scan.angle_increment) for scan in scans]
-    starts, groups = path_starts([chain, chain_back], [scans, blind], [(0, 1), (1, 0)], mount)
+    starts, groups = path_starts([chain, chain_back], [scans, blind], [(0, 1), (1, 0)], [(0.0, 0.0)] * 2, mount)
     assert groups == [0, 0]
     assert_near(starts[1], back[0], 0.05, 1.0)
