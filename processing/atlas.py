@@ -7,7 +7,6 @@ NAME.atlas/map.pgm, .yaml, .png      the stitched picture: a view of the atlas, 
 """
 
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from hw_profiles.errors import BadInputError, RTLogError
 from processing.atlas_schema import check_document
 from processing.map_files import MapImage, Overlay, StoredImage, write_image, write_picture
+from processing.output import refuse_existing
 from processing.tum import write_tum
 from processing.workers import Workers
 
@@ -34,19 +34,6 @@ SCHEMA = 1
 class Atlas:
     document: dict[str, Any]  # what atlas.json holds
     trajectories: dict[str, tuple[NDArray[np.int64], Array]]  # by run id: stamps [ns], poses (m, 3)
-
-
-def refuse_existing(path: Path) -> None:
-    """Raises: BadInputError: the atlas exists already, or its folder does not, or may not be written to."""
-    try:
-        if path.exists() or path.is_symlink():
-            raise BadInputError(f"{path} exists already; it is left as it is")
-        if not path.parent.is_dir():
-            raise BadInputError(f"{path.parent}: no such folder")
-    except OSError as error:  # a name that is too long, a folder above that is closed
-        raise BadInputError(f"{path}: {error.strerror or error}") from error
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise BadInputError(f"{path.parent}: no permission to write here")
 
 
 def write_atlas(path: Path, atlas: Atlas, edges: Sequence[Path], image: MapImage | StoredImage, work: Workers) -> None:

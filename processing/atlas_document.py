@@ -12,7 +12,8 @@ from processing.graph import Graph
 from processing.trajectory import keyframe_poses, run_trajectory
 
 if TYPE_CHECKING:
-    from processing.pipeline import Config, DrivenRun
+    from processing.build import Config
+    from processing.pipeline import DrivenRun
 
 
 def assemble_atlas(

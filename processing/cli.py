@@ -82,15 +82,15 @@ def _jobs(text: str) -> int:
 def _build(args: argparse.Namespace) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads wait for each other; --jobs does not
     from hw_profiles.profile import load_profile
-    from processing.atlas import caveats, refuse_existing
-    from processing.pipeline import Config, build
+    from processing.build import Config, build
 
-    refuse_existing(args.output)
     began = time.monotonic()
     profile = load_profile(args.profile) if args.profile else None
     config = Config(args.method, args.assembly, args.matcher)
     atlas = build(args.recordings, profile, config, args.output, args.jobs)
     document = atlas.document
+    from processing.atlas import caveats
+
     for line in caveats(document):
         print(f"rtlog-atlas: {line}", file=sys.stderr)
     summary = {

@@ -1,27 +1,24 @@
-"""The whole method in one screen: recordings in, atlas out.
+"""The whole method in one screen: runs as they were read in, atlas out.
 
-recordings ─ read_runs ─ open_loop ─┐
-                                    graph ─ pieces (edge_map) ─ assembly ─ edge_files ─ map_files ─ Atlas
-                                      └─────── tags missed ◄───────┘
+runs ─ ready_runs ─ open_loop ─┐
+                               graph ─ pieces (edge_map) ─ assembly ─ edge_files ─ map_files ─ Atlas
+                                 └─────── tags missed ◄───────┘
 """
 
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import RTLogError
-from hw_profiles.profile import Profile
 from processing.atlas import Atlas, write_atlas
 from processing.atlas_document import assemble_atlas
 from processing.beacons import Pass
+from processing.build import Config
 from processing.calibration import WheelScale
-from processing.chain_step import join
 from processing.edge_files import edge_of, store_edge
 from processing.edge_placement import Placement, place_by_frames
 from processing.graph import Graph, Piece, build_graph
@@ -38,11 +35,11 @@ from processing.pieces import PieceInput, SolvedPiece, cut_span, rename, solve_p
 from processing.polar_matching import match_polar
 from processing.polar_scan import ranges_at
 from processing.read_log import Run
-from processing.read_runs import ReadRun, read_runs
+from processing.ready_runs import ReadyRun, make_ready
 from processing.remarks import remarks
 from processing.scan_match import ScanMatch
 from processing.scan_matching import Matcher, match_scans
-from processing.scan_walls import Scan
+from processing.scan_walls import Scan, prepare_scan
 from processing.tag_review import add_missed, leave_out_moved
 from processing.workers import Workers
 
@@ -61,16 +58,6 @@ MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans, "psm": match_polar
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
-    """What `rtlog-atlas build` was asked for; it goes into the atlas, so that a result explains itself."""
-
-    method: Literal["landmark", "global"] = "landmark"
-    assembly: Literal["refined", "paper"] = "refined"
-    matcher: Literal["point-to-line", "psm"] = "point-to-line"
-    resolution_m: float = 0.05
-
-
-@dataclass(frozen=True, slots=True)
 class DrivenRun:
     run: Run
     wheels: WheelScale
@@ -78,25 +65,24 @@ class DrivenRun:
     passes: list[Pass]
 
 
-def build(recordings: list[Path], profile: Profile | None, config: Config, output: Path, jobs: int = 1) -> Atlas:
-    """Map recordings and write the atlas.
-
-    Raises:
-        BadInputError: a recording is unfit, or it cannot be told which run it is, or the output exists already.
-        RTLogError: a disk is full, or a process died.
-    """
+def map_runs(runs: list[Run], config: Config, output: Path, scratch: Path, work: Workers) -> Atlas:
+    """Map what was read, and write the atlas. Raises: as `processing.build.build`."""
     match = MATCHERS[config.matcher]
-    join(np.zeros(3), np.zeros(3))  # at its first kernel numba makes itself ready: here, rather than in every process
-    with Workers(jobs) as work, TemporaryDirectory(prefix="rtlog-atlas-") as temporary:
-        scratch = Path(temporary)
-        read = read_runs(recordings, profile, config.method == "landmark", scratch, work)
-        runs = drive_through(read, work, match)
-        runs, left_out = leave_out_moved(runs)
-        runs, graph, placed = map_network(runs, work, match, config)
-        edges, image = draw(runs, placed, config.resolution_m, scratch, work)
-        atlas = assemble_atlas(runs, graph, placed, config, remarks(runs, placed), left_out)
-        write_atlas(output, atlas, edges, image, work)
+    ready = make_ready(runs, config.method == "landmark", work)
+    driven, left_out = leave_out_moved(drive_through(ready, work, match))
+    driven, graph, placed = map_network(driven, work, match, config)
+    edges, image = draw(driven, placed, config.resolution_m, scratch, work)
+    atlas = assemble_atlas(driven, graph, placed, config, remarks(driven, placed), left_out)
+    write_atlas(output, atlas, edges, image, work)
     return atlas
+
+
+def warm_up() -> None:
+    """Load the kernels that take longest: a quarter of a second for the first of them, in every process that was not
+    forked after.
+    """
+    scan = prepare_scan(np.zeros((3, 2)), 0.0, 0.1)
+    match_scans(scan, scan, np.zeros(3))
 
 
 def map_network(
@@ -120,7 +106,7 @@ def map_network(
     return runs, graph, placed
 
 
-def drive_through(runs: list[ReadRun], work: Workers, match: Matcher) -> list[DrivenRun]:
+def drive_through(runs: list[ReadyRun], work: Workers, match: Matcher) -> list[DrivenRun]:
     """Estimate the runs open loop; every pass becomes a key frame."""
     driven = work.map_groups(
         "runs",

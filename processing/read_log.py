@@ -10,6 +10,7 @@ order that is true.
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,14 +21,17 @@ from numpy.typing import NDArray
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import ROLES, Profile
 from processing.read_scans import ReadScans, ScanReader, Scans, join_scans
-from processing.recordings import Source, Window, cut_windows, survey
+from processing.recordings import Source, Window, cut_windows, group_parts, survey
 from processing.stamps import rising_stamps, take_over_times
+from processing.workers import Workers
 from rtlog_client.log_file import read_messages
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.topics import TAGS, TICK
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+
+MIN_SCANS = 10  # to be mapped: a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,26 @@ def read_log(
     with TemporaryDirectory() as nowhere:
         run = read_log(path, profile, further, Path(nowhere))
         return replace(run, scans=replace(run.scans, ranges=run.scans.ranges[:]))
+
+
+def begin_reading(
+    recordings: list[Path], profile: Profile | None, scratch: Path, work: Workers
+) -> Callable[[], list[Run]]:
+    """Begin to read all of them; what is returned waits for the end of it. The ranges stay in the folder `scratch`.
+
+    Raises (and what is returned, too):
+        BadInputError: a recording is unfit, or it cannot be told which run it is.
+        RTLogError: the disk is full, or a process died.
+    """
+    sources = [survey(parts, profile) for parts in group_parts(recordings)]
+    windows = work.begin_groups("recordings", partial(read_window, scratch=scratch), map(cut_windows, sources))
+    return lambda: [_long_enough(join_windows(*read, scratch), read[0]) for read in zip(sources, windows, strict=True)]
+
+
+def _long_enough(run: Run, source: Source) -> Run:
+    if len(run.scans.times) < MIN_SCANS:
+        raise BadInputError(f"{source.parts[0]}: {len(run.scans.times)} scans are too few to map")
+    return run
 
 
 def read_window(window: Window, scratch: Path) -> Readings:

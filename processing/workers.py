@@ -7,6 +7,7 @@ The processes are forked when there is first something to do: they have all modu
 a second to load them. So a program that has threads of its own must not ask for more than one job.
 """
 
+import gc
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterable, Iterator
@@ -33,18 +34,23 @@ class Workers:
         self._pool = ProcessPoolExecutor(jobs, fork, _end_like_any_other) if jobs > 1 else None
         self._jobs = jobs
 
-    def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-        """Raises: RTLogError: a process died; whatever `function` raises."""
+    def begin(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """The results, in order. Other processes are at work on them from now on.
+
+        Raises: RTLogError: a process died; whatever `function` raises.
+        """
         items = list(items)
-        bar = partial(tqdm, total=len(items), desc=label, disable=None, leave=False)
         if self._pool is None or len(items) < 2:
-            return [function(item) for item in bar(items)]
-        try:
+            results: Iterator[Result] = map(function, items)
+        else:
             with _deaf_children():
+                gc.freeze()  # what is there stays: who is forked need neither look at it nor copy it
                 results = self._pool.map(function, items, chunksize=max(1, len(items) // (32 * self._jobs)))
-            return list(bar(results))
-        except BrokenProcessPool as error:
-            raise RTLogError("a process died, perhaps for want of memory; try fewer --jobs") from error
+        return _told(tqdm(results, total=len(items), desc=label, disable=None, leave=False))
+
+    def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """As `begin`, all of them."""
+        return list(self.begin(label, function, items))
 
     def starmap(self, label: str, function: Callable[..., Result], items: Iterable[tuple[Any, ...]]) -> list[Result]:
         """The same; every item holds all arguments."""
@@ -54,9 +60,14 @@ class Workers:
         self, label: str, function: Callable[[Item], Result], groups: Iterable[Iterable[Item]]
     ) -> list[list[Result]]:
         """The same for groups of items, which are done all together: the results of each group."""
+        return list(self.begin_groups(label, function, groups))
+
+    def begin_groups(
+        self, label: str, function: Callable[[Item], Result], groups: Iterable[Iterable[Item]]
+    ) -> Iterator[list[Result]]:
         listed = [list(group) for group in groups]
-        results = iter(self.map(label, function, [item for group in listed for item in group]))
-        return [list(islice(results, len(group))) for group in listed]
+        results = self.begin(label, function, [item for group in listed for item in group])
+        return (list(islice(results, len(group))) for group in listed)
 
     def __enter__(self) -> Self:
         return self
@@ -68,6 +79,13 @@ class Workers:
             for process in multiprocessing.active_children():
                 process.kill()
         self._pool.shutdown(cancel_futures=True)
+
+
+def _told(results: Iterator[Result]) -> Iterator[Result]:
+    try:
+        yield from results
+    except BrokenProcessPool as error:
+        raise RTLogError("a process died, perhaps for want of memory; try fewer --jobs") from error
 
 
 def _apply(function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result:

@@ -16,8 +16,8 @@ from choices_chain import print_chains
 from choices_solvers import print_solvers
 from choices_worlds import print_relations, print_world
 
+from processing.build import Config, build
 from processing.import_carmen import import_carmen
-from processing.pipeline import Config, build
 from processing.simulation.simulate import simulate
 
 FIRST_SEED = 101

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from processing.pipeline import Config, build
+from processing.build import Config, build
 from processing.pose_graph import Links, Solution, solve
 
 SPACING = "processing.open_loop.KEYFRAME_SPACING_M"

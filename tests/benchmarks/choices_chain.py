@@ -11,7 +11,8 @@ import numpy as np
 import processing.open_loop
 from processing.evaluation import Trajectory, match_truth, relative_error
 from processing.pipeline import MATCHERS, DrivenRun, drive_through
-from processing.read_runs import read_runs
+from processing.read_log import begin_reading
+from processing.ready_runs import make_ready
 from processing.relations import read_relations, relation_errors
 from processing.trajectory import run_trajectory
 from processing.tum import read_tum
@@ -30,7 +31,10 @@ SPACINGS_M = {
 def print_chains(recordings: list[Path], relations: Path | None = None) -> None:
     """All recordings in one row. Errors are those over 10 m and 100 m of driving, or of the relations."""
     one_job = Workers(1)
-    runs = [read_runs([path], None, with_tags=False, scratch=path.parent, work=one_job)[0] for path in recordings]
+    runs = [
+        make_ready(begin_reading([path], None, path.parent, one_job)(), with_tags=False, work=one_job)[0]
+        for path in recordings
+    ]
     measured = "mean error, m | °" if relations is not None else "RPE 10 m, m | RPE 100 m, m | RPE 100 m, °"
     header = f"| key frames | matcher | {measured} | key frames a metre | ms a scan |"
     print(f"{header}\n|{'---|' * (header.count('|') - 1)}")

@@ -24,8 +24,8 @@ from processing.open_loop import OpenLoop
 from processing.pieces import solve_piece
 from processing.pipeline import drive_through, piece_input
 from processing.pose_graph import CORNER, Links, solve, squared_distances
-from processing.read_log import Run
-from processing.read_runs import read_runs
+from processing.read_log import Run, begin_reading
+from processing.ready_runs import make_ready
 from processing.relations import read_relations, relation_errors
 from processing.scan_matching import match_scans
 from processing.trajectory import run_trajectory
@@ -118,7 +118,7 @@ def _timed(solver: Callable[..., object], guess: np.ndarray, links: Links) -> tu
 def problem_of(recording: Path, relations: Path | None) -> Problem:
     """The links that the map of one recording ends with, the doubted ones among them."""
     one_job = Workers(1)
-    read = read_runs([recording], None, with_tags=False, scratch=recording.parent, work=one_job)
+    read = make_ready(begin_reading([recording], None, recording.parent, one_job)(), with_tags=False, work=one_job)
     driven = drive_through(read, one_job, match_scans)
     run, loop = driven[0].run, driven[0].loop
     graph = build_graph([[]], [len(loop)])

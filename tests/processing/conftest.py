@@ -13,7 +13,8 @@ from processing.geometry import align, compose
 from processing.graph import Graph, build_graph
 from processing.pieces import SolvedPiece, solve_piece
 from processing.pipeline import DrivenRun, drive_through, piece_input, piece_names
-from processing.read_runs import read_runs
+from processing.read_log import begin_reading
+from processing.ready_runs import make_ready
 from processing.scan_matching import match_scans
 from processing.simulation.simulate import simulate
 from processing.tum import read_tum
@@ -93,8 +94,8 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def drive_both(world: Path) -> list[DrivenRun]:
     recordings = [world / f"small-{run}.mcap" for run in ("around", "back")]
-    runs = read_runs(recordings, None, with_tags=True, scratch=world, work=Workers(1))
-    return drive_through(runs, Workers(1), match_scans)
+    runs = begin_reading(recordings, None, world, Workers(1))()
+    return drive_through(make_ready(runs, with_tags=True, work=Workers(1)), Workers(1), match_scans)
 
 
 @pytest.fixture(scope="session")

@@ -17,10 +17,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from hw_profiles.errors import BadInputError, RTLogError
-from processing.atlas import Atlas, read_document, refuse_existing, write_atlas
+from processing.atlas import Atlas, read_document, write_atlas
 from processing.edge_files import write_npz
 from processing.geometry import compose, relative, transform
 from processing.map_files import FREE, MapImage, read_map
+from processing.output import refuse_existing
 from processing.tum import read_tum
 from processing.workers import Workers
 from rtlog_client.log_file import read_info

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from processing.build import Config
 from processing.edge_placement import Placement
 from processing.graph import Graph
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.open_loop import mount_pose
-from processing.pipeline import Config, DrivenRun, map_network
+from processing.pipeline import DrivenRun, map_network
 from processing.scan_matching import match_scans
 from processing.workers import Workers
 

@@ -13,9 +13,9 @@ import pytest
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import parse_profile, read_profile_text
 from processing.atlas import Atlas, read_document
+from processing.build import Config, build
 from processing.geometry import align, compose, wrap_angle
 from processing.pieces import drift_suffix
-from processing.pipeline import Config, build
 from processing.tum import read_tum
 from rtlog_client.log_file import LoggedMessage, LogWriter, read_info, read_messages
 from rtlog_server.messages import decode, to_ns

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hw_profiles.errors import BadInputError
-from processing.pipeline import Config, build
+from processing.build import Config, build
 from processing.read_log import read_log
 from processing.recordings import group_parts
 from rtlog_client.log_file import LogWriter, read_info, read_messages

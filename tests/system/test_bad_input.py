@@ -17,7 +17,7 @@ import processing.cli
 import rtlog_client.cli
 import rtlog_server.cli
 from hw_profiles.profile import read_profile_text
-from processing.pipeline import Config, build
+from processing.build import Config, build
 from rtlog_client.log_file import LogWriter
 from rtlog_server.messages import JointState, LaserScan, TagReads, Tick, encode, header, to_time
 from rtlog_server.topics import BY_NAME, JOINT_STATES, PRIMARY_SCAN, TAGS, TICK
