@@ -7,6 +7,7 @@ The processes are forked when there is first something to do: they have all modu
 a second to load them. So a program that has threads of its own must not ask for more than one job.
 """
 
+import ctypes
 import gc
 import multiprocessing
 import signal
@@ -22,6 +23,8 @@ from tqdm import tqdm
 
 from hw_profiles.errors import RTLogError
 
+PR_SET_PDEATHSIG = 1  # of Linux
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -31,7 +34,7 @@ class Workers:
 
     def __init__(self, jobs: int) -> None:
         fork = multiprocessing.get_context("fork")
-        self._pool = ProcessPoolExecutor(jobs, fork, _end_like_any_other) if jobs > 1 else None
+        self._pool = ProcessPoolExecutor(jobs, fork, _end_with_the_program) if jobs > 1 else None
         self._jobs = jobs
 
     def begin(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -92,9 +95,10 @@ def _apply(function: Callable[..., Result], arguments: tuple[Any, ...]) -> Resul
     return function(*arguments)
 
 
-def _end_like_any_other() -> None:
-    """What the command does at SIGTERM is not for its processes."""
+def _end_with_the_program() -> None:
+    """What the program does at SIGTERM is not for its processes; and where it is killed, they end."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 @contextmanager

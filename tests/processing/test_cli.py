@@ -192,3 +192,14 @@ def test_a_process_that_dies_is_one_line(small_world: Path, tmp_path: Path) -> N
         assert process.wait(timeout=10) == 1
         assert_alone(process.pid)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_program_that_is_killed_takes_its_processes_along(
+    small_world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away what is in there
+    with building(small_world, tmp_path / "a.atlas", jobs=2) as (process, _):
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.wait(timeout=10) == -signal.SIGKILL
+        assert_alone(process.pid)
+    assert not (tmp_path / "a.atlas").exists()
