@@ -34,19 +34,22 @@ class Ranges:
     def __getitem__(self, which: int | slice | Ints) -> Rows:
         """Rows (k, B), or one (B,). Rows that follow each other are read in one go.
 
-        Raises: RTLogError: the file is shorter than it was.
+        Raises: RTLogError: the file is shorter than it was, or gone.
         """
         rows = np.arange(len(self))[which]
         wanted = np.atleast_1d(rows)
         breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
         found = np.empty((len(wanted), self.shape[1]), np.float32)
-        with self.path.open("rb") as file:
-            for start, end in zip([0, *breaks], [*breaks, len(wanted)], strict=True):
-                if start < end:
-                    file.seek((self.first + int(wanted[start])) * found.itemsize * self.shape[1])
-                    part = found[start:end]
-                    if file.readinto(part.data) != part.nbytes:
-                        raise RTLogError(f"{self.path}: was cut short while it was in use")
+        try:
+            with self.path.open("rb") as file:
+                for start, end in zip([0, *breaks], [*breaks, len(wanted)], strict=True):
+                    if start < end:
+                        file.seek((self.first + int(wanted[start])) * found.itemsize * self.shape[1])
+                        part = found[start:end]
+                        if file.readinto(part.data) != part.nbytes:
+                            raise RTLogError(f"{self.path}: was cut short while it was in use")
+        except OSError as error:
+            raise RTLogError(f"{self.path}: was lost while it was in use: {error.strerror or error}") from error
         found = found[:, ::-1] if self.is_mirrored else found
         return found if np.ndim(rows) else found[0]
 

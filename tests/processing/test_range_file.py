@@ -66,3 +66,14 @@ def test_a_file_that_was_cut_short_gives_no_made_up_rows(tmp_path: Path) -> None
     assert_array_equal(ranges[:11], ROWS[:11])
     with pytest.raises(RTLogError, match="cut short"):
         ranges[10:]
+
+
+def test_a_file_that_is_lost_or_cut_short_is_told(tmp_path: Path) -> None:
+    ranges = write(tmp_path / "a", [30] * 12)
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes()[:-1])
+    assert ranges[10].shape == (30,)
+    with pytest.raises(RTLogError, match="a: was cut short while it was in use"):
+        ranges[11]
+    (tmp_path / "a").unlink()
+    with pytest.raises(RTLogError, match="a: was lost while it was in use: No such file"):
+        ranges[0]
