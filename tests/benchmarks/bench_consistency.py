@@ -12,12 +12,12 @@ import numpy as np
 from table import Figure, report
 
 from processing.atlas import read_document
+from processing.build import Config, build
 from processing.comparison import read_trajectories
 from processing.consistency import consistency, edge_errors
 from processing.evaluation import truth_at
 from processing.geometry import Array
 from processing.open_loop import odometry_at_scans
-from processing.build import Config, build
 from processing.read_log import read_log
 from processing.simulation.simulate import simulate
 from processing.tum import read_tum
