@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
 
 from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
 from processing.geometry import accumulate, compose, relative, wrap_angle
@@ -204,3 +205,16 @@ def test_links_that_agree_close_a_loop_that_came_back_a_metre_off() -> None:
         poses, weights = solve_frames(corners, pieces, links, first_of(5))
         assert np.hypot(*poses[4, :2]) < off
         assert np.all(weights > 0.9) == (count == 12)
+
+
+def test_a_pass_that_ends_two_paths_of_one_piece_holds_them_together() -> None:
+    """A run turns at a tag: in the piece, poses 1 and 2 are the same pass, which the piece alone has 0.2 m apart."""
+    local = np.array([[0, 0, 0], [10.1, 0, 0], [9.9, 0.1, 0], [0, 1, 0.1]])
+    piece = Condensed(np.array([0, 1, 1, 2]), local, 10.0 * (np.eye(9) + 0.5 * np.eye(9, k=3)))
+    start = local[[0, 1, 3]]
+    poses, _ = solve_frames(start, [piece], no_links(), first_of(3), max_iterations=3)  # Newton needs no more
+
+    def errors(free: np.ndarray) -> np.ndarray:
+        return piece.root @ (free.reshape(2, 3)[[0, 0, 1]] - local[1:]).ravel()
+
+    assert_allclose(poses[1:], least_squares(errors, start[1:].ravel(), xtol=1e-12).x.reshape(2, 3), atol=1e-6)

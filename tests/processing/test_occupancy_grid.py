@@ -154,3 +154,29 @@ def test_windows_make_the_same_map_as_the_whole(room: Grid) -> None:
 def test_grids_of_different_cells_are_refused(room: Grid) -> None:
     with pytest.raises(ValueError, match="one resolution"):
         stitch([room, Grid(room.log_odds, 0.1, room.origin)], np.zeros((2, 3)))
+
+
+def cells_passed(pose: np.ndarray, ranges: np.ndarray) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
+    """Row and column, from the frame's origin, of the cells that single beams pass and end in: one after the other."""
+    passed, hit = set(), set()
+    for bearing, distance in zip(pose[2] + ANGLES, ranges, strict=True):
+        start, way = pose[:2] / CELL, distance / CELL * np.array([np.cos(bearing), np.sin(bearing)])
+        steps = np.abs(way).max()
+        for x, y in start + way * (np.arange(int(steps)) / steps)[:, None]:
+            passed.add((int(np.floor(y)), int(np.floor(x))))
+        x, y = start + way
+        hit.add((int(np.floor(y)), int(np.floor(x))))
+    return passed - hit, hit
+
+
+def test_beams_that_pass_for_their_neighbours_leave_no_cell_out() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(10):
+        pose = np.array([*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)])
+        rubble = rng.uniform(0.3, 1.0, len(ANGLES)) if rng.random() < 0.5 else 1.0
+        ranges = 0.993 * rubble * scan_room(pose)  # the room's walls lie between two cells
+        grid = draw(pose[None], ranges[None], ANGLES)
+        first = np.rint(grid.origin[::-1] / CELL).astype(int)
+        for expected, found in zip(cells_passed(pose, ranges), (grid.cells < 0, grid.cells > 0), strict=True):
+            cells = {tuple(cell) for cell in (np.argwhere(found) + first).tolist()}
+            assert len(cells ^ expected) <= 0.003 * len(expected)  # float and fixed point at the edges of cells

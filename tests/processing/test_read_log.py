@@ -24,7 +24,8 @@ from recorded_drive import (
 
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import load_profile, parse_profile
-from processing.read_log import read_log
+from processing.read_log import join_windows, read_log, read_window
+from processing.recordings import cut_windows, survey
 from rtlog_client.log_file import LogWriter
 from rtlog_server.messages import (
     JointState,
@@ -69,6 +70,28 @@ def test_our_own_recording(record: Record) -> None:
     # one clock: scans, wheels and reads keep their distances
     assert_allclose(run.motion_times - run.scans.times, 0.018, atol=1e-9)
     assert_allclose(run.tags.times - run.scans.times[7], -0.010, atol=1e-9)
+
+
+def test_windows_of_a_recording_make_the_whole(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def jumbled(k: int) -> list[Message]:  # log times run backwards now and then
+        *before, (topic, log_time_ns, message) = ours(k)
+        return [*before, (topic, log_time_ns - 250_000_000 * (k % 7 == 3), message)]
+
+    monkeypatch.setattr("rtlog_client.log_file.CHUNK_BYTES", 5000)
+    path = record(drive(jumbled), TRAILER)
+    whole = read_log(path)
+    monkeypatch.setattr("rtlog_client.log_file.STRETCH_BYTES", 1)
+    source = survey((path,), None)
+    windows = cut_windows(source)
+    assert len(windows) > 10
+    run = join_windows(source, [read_window(window, tmp_path) for window in windows], tmp_path)
+    for field in ("scan_ticks", "motion_ns", "motion_times", "wheels"):
+        assert_array_equal(getattr(run, field), getattr(whole, field), field)
+    for field in ("stamps_ns", "times"):
+        assert_array_equal(getattr(run.scans, field), getattr(whole.scans, field), field)
+    assert_array_equal(run.scans.ranges[:], whole.scans.ranges)
+    assert_array_equal(run.tags.times, whole.tags.times)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".ranges"] == ["monday.ranges"]
 
 
 def test_wheels_come_by_their_roles_not_by_their_order(record: Record) -> None:
