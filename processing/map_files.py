@@ -225,7 +225,9 @@ def draw_map(image: MapImage | StoredImage, overlay: Overlay) -> Image.Image:
     font, r = ImageFont.load_default(size=size), size // 3
     for (x, y), name in zip(place(overlay.nodes), overlay.names, strict=True):
         draw.ellipse((x - r, y - r, x + r, y + r), fill=RED, outline=OPEN)
-        draw.text((x + 2 * r, y - 2 * r), name, fill=RED, font=font, stroke_width=2, stroke_fill=OPEN)
+        fits = x + 2 * r + draw.textlength(name, font=font) < picture.width
+        at, anchor = (x + 2 * r, "la") if fits else (x - 2 * r, "ra")  # to the left, where the picture ends
+        draw.text((at, y - 2 * r), name, fill=RED, font=font, anchor=anchor, stroke_width=2, stroke_fill=OPEN)
     _draw_scale_bar(draw, picture, pixels_per_m, font)
     return picture
 
