@@ -38,7 +38,8 @@ MAX_SIGMA_M = 0.02  # a match that knows the way less well says nothing of a per
 PAIR_NOISE_M = 0.01  # what slip and roughness leave of one pair
 MEDIAN = 0.455  # of chi squared with one degree of freedom
 PRIOR = 0.02  # wheels err by so much, before anything is known
-AT_ONCE = 1.6  # pairs overlap and share their slip: so many of them count as one
+AT_ONCE = 1.6  # pairs overlap and share their scans: so many of them count as one; and where
+ALL_AT_ONCE = 4.0  # slip outweighs what matches err by, as many as every metre lies in: two of each stride
 LEAST_NOISE = 0.25  # of the profile's: what wheels do where nobody sees them is not better known than that
 MAX_SIGMA = 0.003  # an estimate less sure than this is left alone
 
@@ -166,12 +167,19 @@ def stride_pairs(way: Array) -> Ints:
 
 
 def fit_scale(counted: Array, seen: Array, variances: Array) -> WheelScale:
-    """Weighted robust mean of seen over counted distance, drawn to 1 by what is known of wheels beforehand."""
+    """Weighted robust mean of seen over counted distance, drawn to 1 by what is known of wheels beforehand.
+
+    Where the pairs scatter by more than their variances say, wheels slip, and each pair says less (Birge's ratio).
+    """
+    if not len(seen):
+        return WheelScale(1.0, PRIOR, 0, float("nan"))
     scale, information = 1.0, PRIOR**-2
     for _ in range(20):
         doubts = (seen - scale * counted) ** 2 / variances
-        weights = counted**2 / variances / (1 + doubts / 4) ** 2  # Geman-McClure: a match that jumped is none
+        spread = max(1.0, float(np.median(doubts)) / MEDIAN)
+        weights = counted**2 / (spread * variances) / (1 + doubts / spread / 4) ** 2  # Geman-McClure: some jumped
         information = PRIOR**-2 + float(weights.sum())
         scale = (PRIOR**-2 + float((weights / counted) @ seen)) / information
-    noise = float(np.sqrt(np.median((seen - scale * counted) ** 2 / np.abs(counted)) / MEDIAN)) if len(seen) else np.nan
-    return WheelScale(float(scale), (information / AT_ONCE) ** -0.5 if len(seen) else PRIOR, len(counted), noise)
+    noise = np.sqrt(np.median((seen - scale * counted) ** 2 / np.abs(counted)) / MEDIAN)
+    at_once = AT_ONCE / spread + ALL_AT_ONCE * (1 - 1 / spread)
+    return WheelScale(float(scale), (information / at_once) ** -0.5, len(counted), float(noise))
