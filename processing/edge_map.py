@@ -52,6 +52,7 @@ class Path:
     chain: Links  # K - 1 weak links, between (0, 1), (1, 2) …
     wheels: Links  # K - 1, odometry alone
     start: Array  # (3,) first guess of the first pose in the frame of the piece
+    start_doubt_m: float = 0.0  # how far off that may be
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +89,10 @@ class Drift:
     sway_m: float = 0.0  # what the heading's error makes of the way: it adds up as metres, not as variances
     way_m: float = 0.0
 
+    @staticmethod
+    def of(radius_m: float, radius_rad: float) -> "Drift":
+        return Drift((radius_m / 3) ** 2, (radius_rad / 3) ** 2)
+
     def after(self, chain: Links) -> "Drift":
         covariances = np.linalg.inv(chain.informations)
         turn = self.variance_rad2 + np.cumsum(covariances[:, 2, 2])
@@ -102,7 +107,7 @@ class Drift:
 
     def at_most(self, radius_m: float, radius_rad: float) -> "Drift":
         """This drift, or a smaller one that is known from elsewhere."""
-        return self if self.radius_m <= radius_m else Drift((radius_m / 3) ** 2, (radius_rad / 3) ** 2)
+        return self if self.radius_m <= radius_m else Drift.of(radius_m, radius_rad)
 
     @property
     def is_astray(self) -> bool:
@@ -132,7 +137,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
     present = np.zeros(len(poses), bool)
     strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
-        drift = Drift()
+        drift = Drift.of(paths[path].start_doubt_m, LOST_RAD if paths[path].start_doubt_m else 0.0)
         for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
             if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
@@ -142,7 +147,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
             present[stretch] = True
             found, poses, lost = _close(frames, poses, links + loops, stretch, old, present, strayed, drift)
             if lost:
-                drift = Drift((LOST_M / 3) ** 2, (LOST_RAD / 3) ** 2)
+                drift = Drift.of(LOST_M, LOST_RAD)
             loops = loops + found
             if len(found):
                 poses = _solve_present(poses, links + loops, present)

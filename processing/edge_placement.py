@@ -20,9 +20,8 @@ from processing.linked_paths import TAG_INFORMATION, TagJoin, join_groups, merge
 from processing.overlaps import find_overlaps, link_overlaps
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links, Solution, solve
-from processing.registration import register_passes
+from processing.registration import Passing, register_passes
 from processing.scan_matching import Matcher
-from processing.scan_walls import Scan
 from processing.workers import Workers
 
 Array = NDArray[np.float64]
@@ -73,9 +72,12 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
     for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
         seen_in |= {v: (piece, i) for v, i in zip(variables, indices, strict=True)}
 
-    def scan(variable: int) -> Scan:
+    def passing(variable: int) -> Passing:
         piece, index = seen_in[variable]
-        return piece.scan(index)[0]
+        p = piece.path_of(index)
+        first, last = piece.ends(p)
+        reach_m = piece.input.piece.spans[p].reaches_m[index == last]
+        return Passing(piece.map.poses[first : last + 1], piece.input.paths[p].scans, index - first, reach_m)
 
     edges = [(variables[0], v) for variables in boundary.variables for v in variables]
     shape = (boundary.count, boundary.count)
@@ -85,7 +87,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
         linked: list[int] = []
         for v in passes:
             for u in [u for u in linked if part[u] != part[v]][:3]:
-                found = register_passes(scan(u), scan(v), solved[0].input.mount)
+                found = register_passes(passing(u), passing(v), solved[0].input.mount)
                 if found is not None:
                     ends.append((u, v))
                     motions.append(found.motion)

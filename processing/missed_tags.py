@@ -19,7 +19,7 @@ from processing.beacons import Pass
 from processing.geometry import relative
 from processing.scan_matching import Matcher
 from processing.scan_walls import Scan
-from processing.strong_links import LOOP_INLIERS, match_vehicles, worth_a_link
+from processing.strong_links import LOOP_INLIERS, facing, match_vehicles, worth_a_link
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -96,6 +96,7 @@ class _Track:
 
 
 def _sees_the_same(reference: MappedRun, i: int, run: MappedRun, k: int, match: Matcher) -> bool:
+    i, k = facing(reference.poses, i, run.poses, k, run.mount)
     guess = relative(reference.poses[i], run.poses[k])
     return worth_a_link(match_vehicles(reference.scans[i], run.scans[k], guess, run.mount, match), LOOP_INLIERS)
 

@@ -51,8 +51,11 @@ class SolvedPiece:
 
     def scan(self, index: int) -> StoredScans:
         """That of one of the N key frames, alone."""
-        p = int(np.searchsorted(self.map.firsts, index, side="right")) - 1
+        p = self.path_of(index)
         return self.input.paths[p].scans.alone(index - int(self.map.firsts[p]))
+
+    def path_of(self, index: int) -> int:
+        return int(np.searchsorted(self.map.firsts, index, side="right")) - 1
 
     def ends(self, p: int) -> tuple[int, int]:
         """Indices of the first and last pose of path `p`."""
@@ -75,7 +78,7 @@ def cut_span(run_id: str, loop: OpenLoop, span: Span) -> tuple[Path, Sight]:
 
 def split_drifts(given: PieceInput) -> list[PieceInput]:
     """Register the paths of a piece to each other; two drifts between the same two tags become two pieces."""
-    starts, groups = path_starts(
+    starts, groups, doubts_m = path_starts(
         chains=[path.chain for path in given.paths],
         scans=[path.scans for path in given.paths],
         ends=[(span.start, span.end) for span in given.piece.spans],
@@ -89,7 +92,7 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
             PieceInput(
                 given.name + drift_suffix(number),
                 replace(given.piece, spans=tuple(given.piece.spans[p] for p in chosen)),
-                tuple(replace(given.paths[p], start=starts[p]) for p in chosen),
+                tuple(replace(given.paths[p], start=starts[p], start_doubt_m=doubts_m[p]) for p in chosen),
                 tuple(given.sights[p] for p in chosen),
                 given.mount,
             )

@@ -1,28 +1,30 @@
 """Where the paths of a piece begin in its frame: passes of the same tag, registered to each other by their scans.
 
 The centre of a read cloud jitters by a metre or more from pass to pass, and nothing in a read says which way the
-vehicle was heading. Both are found by matching the two scans at the passes from starts spread around the tag, facing
-both ways. Paths that cannot lie in the same drift, though they join the same tags, are told apart here.
+vehicle was heading. Both are found by matching two scans, those of the passes or of places near by from which the
+scanners face each other, from starts spread around the tag and for both headings. Paths that cannot lie in the same
+drift, though they join the same tags, are told apart here.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.geometry import accumulate, compose, inverse, wrap_angle
+from processing.geometry import accumulate, compose, compose_jacobians, inverse, relative, wrap_angle
 from processing.match_search import agreement, search_match
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch, through_mount
 from processing.scan_matching import CLOSEST_M, match_scans
 from processing.scan_walls import Scan
-from processing.strong_links import extreme_variances
+from processing.strong_links import extreme_variances, facing
 
 Array = NDArray[np.float64]
 
 SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
+FAR_M, FARTHEST_M = 4.0, 8.0  # a tag that is read from further off has clouds that are cut off; no search goes further
 MIN_INLIERS = 0.75
 MIN_WORTH = 0.1  # by agreement: one pair of different places in twenty has as much, nineteen of twenty passes more
 SEEN_M = 0.5  # standard deviation of a motion that the walls tell in every direction
@@ -31,23 +33,30 @@ SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside anot
 QUARTERS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 
 
+@dataclass(frozen=True, slots=True)
+class Passing:
+    """A pass, and the drive before and after it: K key frames."""
+
+    poses: Array  # (K, 3) in any frame
+    scans: Sequence[Scan]  # K
+    index: int  # of the pass
+    reach_m: float = 0.0  # how far its tag is read
+
+    @property
+    def pose(self) -> Array:
+        return np.asarray(self.poses[self.index])
+
+
 def is_open(match: ScanMatch) -> bool:
     """Do the walls leave some direction of the motion open?"""
     return extreme_variances(match.covariance)[1] > SEEN_M**2
 
 
-def pass_hypotheses(
-    reference: Scan, current: Scan, mount: Array, headings: Sequence[float] = (0.0, np.pi)
-) -> list[ScanMatch]:
-    """Motions of the vehicle from one pass of a tag to another, one for each heading that fits; the better first."""
-    return [match for _, match in _weigh_headings(reference, current, mount, headings)]
-
-
-def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch | None:
+def register_passes(reference: Passing, current: Passing, mount: Array) -> ScanMatch | None:
     """The motion from one pass to another; None where the scans do not tell all of it, or not which way the vehicle
     faced: between smooth walls a drift looks like the next.
     """
-    found = _weigh_headings(reference, current, mount, QUARTERS)
+    found = pass_hypotheses(reference, current, mount, QUARTERS)
     if not found or is_open(found[0][1]):
         return None
     worth, best = found[0]
@@ -55,17 +64,41 @@ def register_passes(reference: Scan, current: Scan, mount: Array) -> ScanMatch |
     return best if not others or worth - others[0] >= CLEARLY_BETTER else None
 
 
-def _weigh_headings(
-    reference: Scan, current: Scan, mount: Array, headings: Sequence[float]
+def pass_hypotheses(
+    reference: Passing, current: Passing, mount: Array, headings: Sequence[float] = (0.0, np.pi)
 ) -> list[tuple[float, ScanMatch]]:
-    guesses = [np.array([0.0, 0.0, heading]) for heading in headings]
-    found = [of for guess in guesses if (of := _search_around(reference, current, guess, mount)) is not None]
+    """Motions of the vehicle from one pass of a tag to another, one for each heading that fits, and what each is worth;
+    the better first.
+    """
+    found = []
+    reach_m = max(reference.reach_m, current.reach_m)
+    radius_m = min(reach_m, FARTHEST_M) if reach_m > FAR_M else SEARCH_M
+    for heading in headings:
+        guess = np.array([0.0, 0.0, heading])
+        there = compose(compose(compose(reference.pose, guess), inverse(current.pose)), current.poses)
+        i, k = facing(reference.poses, reference.index, there, current.index, mount)
+        guess = relative(reference.poses[i], there[k])
+        weighed = _search_around(reference.scans[i], current.scans[k], guess, mount, radius_m)
+        if weighed is not None:
+            before, after = relative(reference.pose, reference.poses[i]), relative(current.poses[k], current.pose)
+            found.append((weighed[0], _between(before, weighed[1], after)))
     return sorted(found, key=lambda of: of[0], reverse=True)
 
 
-def _search_around(reference: Scan, current: Scan, guess: Array, mount: Array) -> tuple[float, ScanMatch] | None:
+def _between(before: Array, match: ScanMatch, after: Array) -> ScanMatch:
+    """A match with what was driven before it and after it, which adds no doubt over metres."""
+    _, by_match = compose_jacobians(before, match.motion)
+    motion = compose(before, match.motion)
+    by_both, _ = compose_jacobians(motion, after)
+    jacobian = by_both @ by_match
+    return replace(match, motion=compose(motion, after), covariance=jacobian @ match.covariance @ jacobian.T)
+
+
+def _search_around(
+    reference: Scan, current: Scan, guess: Array, mount: Array, radius_m: float = SEARCH_M
+) -> tuple[float, ScanMatch] | None:
     """The best match around a guess, of the vehicle, and its worth."""
-    match = search_match(reference, current, compose(inverse(mount), compose(guess, mount)), SEARCH_M, SEARCH_RAD)
+    match = search_match(reference, current, compose(inverse(mount), compose(guess, mount)), radius_m, SEARCH_RAD)
     if not (match.converged and match.inliers >= MIN_INLIERS):
         return None
     # What the other scan should have seen counts as well: one step from there looks without going anywhere.
@@ -91,25 +124,29 @@ def path_starts(
     ends: list[tuple[int | None, int | None]],  # nodes at the first and last key frame of each path
     reaches_m: list[tuple[float, float]],  # how far the tags there are read
     mount: Array,
-) -> tuple[list[Array], list[int]]:
-    """The start of each path (3,) in the frame of the first path of its group, and each path's group.
+) -> tuple[list[Array], list[int], list[float]]:
+    """The start of each path (3,) in the frame of the first path of its group, each path's group, and how far off its
+    start may be [m]: nothing where scans told it.
 
     The first path of a group starts at zero. Paths of one group lie in the same drift.
     """
     poses = [accumulate(np.zeros(3), chain.motions) for chain in chains]
     starts: list[Array] = []
     groups: list[int] = []
+    doubts_m: list[float] = []
     for p in range(len(chains)):
         for leader in dict.fromkeys(groups):
             placed = _place_beside(leader, p, poses, scans, ends, reaches_m, mount)
             if placed is not None:
                 groups.append(leader)
-                starts.append(placed)
+                starts.append(placed[0])
+                doubts_m.append(placed[1])
                 break
         else:
             groups.append(p)
             starts.append(np.zeros(3))
-    return starts, groups
+            doubts_m.append(0.0)
+    return starts, groups, doubts_m
 
 
 def _place_beside(
@@ -120,9 +157,10 @@ def _place_beside(
     ends: list[tuple[int | None, int | None]],
     reaches_m: list[tuple[float, float]],
     mount: Array,
-) -> Array | None:
-    """The start of path `b` in the frame of path `a`, by the nodes that both touch; None: they lie in different drifts,
-    or nothing tells how they lie to each other.
+) -> tuple[Array, float] | None:
+    """The start of path `b` in the frame of path `a`, by the nodes that both touch, and how far off it may be [m].
+
+    None: they lie in different drifts, or nothing tells how they lie to each other.
     """
     shared = [
         (end_a, end_b)
@@ -132,30 +170,31 @@ def _place_beside(
     ]
     jitter_m = [max(SAME_DRIFT_M, reaches_m[a][of]) for of, _ in shared]
     turn = _turn_by_tags(poses[a][[of for of, _ in shared]], poses[b][[of for _, of in shared]], sum(jitter_m))
-    places: list[tuple[bool, Array]] = []
+    places: list[tuple[bool, float, Array]] = []
     for end_a, end_b in shared:
-        one, other = scans[a][end_a], scans[b][end_b]
+        one = Passing(poses[a], scans[a], end_a % len(poses[a]), reaches_m[a][end_a])
+        other = Passing(poses[b], scans[b], end_b % len(poses[b]), reaches_m[b][end_b])
         if turn is None:  # the tags lie together: nothing but clear scans says how the paths lie
             clear = register_passes(one, other, mount)
-            found = [clear] if clear is not None else []
+            found = [(1.0, clear)] if clear is not None else []
         else:
             by_tags = turn + poses[b][end_b][2] - poses[a][end_a][2]
             found = pass_hypotheses(one, other, mount, (0.0, np.pi, float(by_tags)))
-        for match in found:
+        for worth, match in found:
             start = compose(compose(poses[a][end_a], match.motion), inverse(poses[b][end_b]))
-            places.append((is_open(match), start))
+            places.append((is_open(match), -worth, start))
     # An end where the scans see the motion along the drift too says more than one between smooth walls.
-    places.sort(key=lambda of: of[0])
+    places.sort(key=lambda of: of[:2])
     if turn is not None:  # where no scan tells, the tags coincide
         at = np.array([0.0, 0.0, turn])
-        places += [(True, _shifted(at, poses[a][of], compose(at, poses[b][to]))) for of, to in shared]
+        places += [(True, 0.0, _shifted(at, poses[a][of], compose(at, poses[b][to]))) for of, to in shared]
     drift_m = SAME_DRIFT_SHARE * float(np.hypot(*np.diff(poses[b][:, :2], axis=0).T).sum())
-    for _, start in places:
+    for blind, _, start in places:
         there = compose(start, poses[b])
         apart_m = [float(np.hypot(*(there[to] - poses[a][of])[:2])) for of, to in shared]
         meet = all(apart < most + drift_m for apart, most in zip(apart_m, jitter_m, strict=True))
         if meet and lies_along(poses[a], there):
-            return start
+            return start, max(jitter_m) if blind else 0.0
     return None
 
 

@@ -34,6 +34,7 @@ LOOP_INLIERS = 0.6
 UNSEEN_M = 1.0  # a motion known no better than this was not seen
 TILT_M, TILT_RAD = 0.02, 0.02
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
+NEARER = 0.1  # m of view that a metre nearer to the place is worth
 VIEW_M = 2.0  # so far before the scanner is the middle of what it sees of a drift
 
 
@@ -66,6 +67,25 @@ def viewpoints(poses: Array, mount: Array) -> Array:
     where they stand side by side, those that drove opposite ways where their scanners face each other.
     """
     return np.asarray(compose(compose(poses, mount), np.array([VIEW_M, 0.0, 0.0]))[:, :2])
+
+
+def facing(one: Array, i: int, other: Array, k: int, mount: Array) -> tuple[int, int]:
+    """The key frames of two drives near i and k that look at the same walls; poses (n, 3) and (m, 3) in one frame."""
+    near_i, near_k = _neighbours(one, i), _neighbours(other, k)
+    first, second = viewpoints(one[near_i], mount), viewpoints(other[near_k], mount)
+    apart = np.hypot(*np.moveaxis(first[:, None] - second[None], -1, 0))
+    away = np.hypot(*(one[near_i] - one[i])[:, :2].T)[:, None] + np.hypot(*(other[near_k] - other[k])[:, :2].T)
+    best = np.unravel_index(int(np.argmin(apart + NEARER * away)), apart.shape)
+    return int(near_i[best[0]]), int(near_k[best[1]])
+
+
+def _neighbours(poses: Array, i: int) -> Ints:
+    """Of a drive (n, 3), the key frames in a row around one that lie within sight of it."""
+    beyond = np.hypot(*(poses - poses[i])[:, :2].T) > 2 * VIEW_M + 1.0
+    before, after = np.flatnonzero(beyond[:i]), np.flatnonzero(beyond[i:])
+    first = int(before[-1]) + 1 if len(before) else 0
+    last = i + int(after[0]) if len(after) else len(poses)
+    return np.arange(first, last)
 
 
 def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: float) -> Ints:

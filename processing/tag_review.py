@@ -15,9 +15,8 @@ from processing.edge_placement import Placement
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
 from processing.open_loop import mount_pose
-from processing.registration import register_passes
+from processing.registration import Passing, register_passes
 from processing.scan_matching import Matcher
-from processing.scan_walls import Scan
 from processing.trajectory import keyframe_poses
 
 REACH_M = 20.0  # from the middle of a cloud to its ends; no reader of passive tags reaches as far
@@ -33,13 +32,15 @@ def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[di
     riding = {found.epc for run in runs for found in _passed_on_and_on(run)}
     staying = _without(runs, riding)
 
-    def scan_of(of: PassId) -> Scan:
-        loop = staying[of[0]].loop
-        return loop.scans[int(np.searchsorted(loop.keyframes, staying[of[0]].passes[of[1]].centre))]
+    open_loop = [run.loop.keyframe_poses for run in staying]
+
+    def passing(of: PassId) -> Passing:
+        loop, centre = staying[of[0]].loop, staying[of[0]].passes[of[1]].centre
+        return Passing(open_loop[of[0]], loop.scans, int(np.searchsorted(loop.keyframes, centre)))
 
     @cache
     def same_walls(first: PassId, second: PassId) -> bool:
-        return register_passes(scan_of(first), scan_of(second), mount_pose(staying[first[0]].run)) is not None
+        return register_passes(passing(first), passing(second), mount_pose(staying[first[0]].run)) is not None
 
     moved = find_moved([_open_passes(run) for run in staying], same_walls)
     reasons = dict.fromkeys(riding, RIDES) | dict.fromkeys(moved, MOVED)

@@ -128,6 +128,18 @@ def test_a_poor_first_guess_converges_to_the_same(seed: int) -> None:
     assert gap(poses, expected) < 1e-3
 
 
+def test_what_only_links_join_is_laid_out_by_the_surest_of_them() -> None:
+    """A tag alone, three metres unsure, says less than a match, whichever was found first."""
+    root, at = np.eye(3), np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    pieces = [Condensed(np.array(variables), at, root) for variables in ([0, 1], [2, 3])]
+    ends, motions = np.array([[0, 2], [1, 3]]), np.array([[3.0, -2.0, 0.5], [1.0, 0.0, 0.0]])
+    for order in ([0, 1], [1, 0]):
+        informations = np.array([np.eye(3) / 9, np.eye(3) * 1e4])[order]
+        poses, part, _ = lay_out(pieces, Links.of(ends[order], motions[order], informations, robust=False), 4)
+        assert np.all(part == 0)
+        assert_allclose(poses[3], [11.0, 0.0, 0.0], atol=1e-12)
+
+
 def test_the_answer_does_not_depend_on_the_frame() -> None:
     network = build_network(2, 1e-2)
     pieces = network.condense()

@@ -107,3 +107,9 @@ def test_the_order_of_the_runs_changes_no_node() -> None:
     one, other = build_graph([first, second], [50, 50]), build_graph([second, first], [50, 50])
     assert [node.epc for node in one.nodes] == [node.epc for node in other.nodes]
     assert [(p.i, p.j) for p in one.pieces] == [(p.i, p.j) for p in other.pieces]
+
+
+def test_a_span_knows_how_far_its_tags_are_read_by_any_run() -> None:
+    far = [Pass(A, 20, 10, 30, 0.0, 0.0, 7.5)]
+    (edge,) = [piece for piece in build_graph([run((A, 10), (B, 40)), far], [100, 100]).pieces if piece.j is not None]
+    assert edge.spans[0].reaches_m == (7.5, 0.5)

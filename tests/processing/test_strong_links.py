@@ -1,10 +1,11 @@
 """What strong links may claim: links between drives must not pretend to see along a smooth drift."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
-from processing.scan_matching import UNSEEN_VARIANCE
-from processing.strong_links import blur, extreme_variances
+from processing.scan_matching import UNSEEN_VARIANCE, match_scans
+from processing.strong_links import VIEW_M, KeyFrames, blur, extreme_variances, facing, loop_pairs
 
 
 def unseen_along(tilt_rad: float, turn_per_m: float) -> np.ndarray:
@@ -35,3 +36,26 @@ def test_extreme_variances_are_eigenvalues() -> None:
         covariance = root @ root.T
         expected = np.linalg.eigvalsh(covariance[:2, :2])
         np.testing.assert_allclose(extreme_variances(covariance), expected, rtol=1e-6, atol=1e-9 * expected[1])
+
+
+OUT = np.column_stack([np.arange(0, 30, 0.5), np.zeros(60), np.zeros(60)])
+BACK = np.column_stack([np.arange(30, 0, -0.5), np.full(60, 0.3), np.full(60, np.pi)])
+
+
+@pytest.mark.parametrize("ahead_m", [1.5, -0.6])
+def test_drives_both_ways_are_matched_where_their_scanners_face_each_other(ahead_m: float) -> None:
+    """Scanners that look away from each other see no wall in common, above all in a narrow drift."""
+    mount = np.array([ahead_m, 0.0, 0.0 if ahead_m > 0 else np.pi])
+    looks = np.sign(ahead_m)
+    frames = KeyFrames([], np.repeat([0, 1], 60), np.tile(np.arange(0, 30, 0.5), 2), mount, match_scans)
+    pairs = loop_pairs(frames, np.vstack([OUT, BACK]), np.arange(60, 120), np.arange(60), 1.0)
+    assert len(pairs) > 30
+    scanners = OUT[pairs[:, 0], 0] + ahead_m, BACK[pairs[:, 1] - 60, 0] - ahead_m
+    assert_allclose(looks * (scanners[1] - scanners[0])[1:-1], 2 * VIEW_M, atol=0.51)
+    i, k = facing(OUT, 30, BACK, 30, mount)
+    assert_allclose(looks * (BACK[k, 0] - ahead_m - OUT[i, 0] - ahead_m), 2 * VIEW_M, atol=0.51)
+
+
+def test_drives_the_same_way_are_matched_side_by_side() -> None:
+    beside = OUT + np.array([0.2, 0.5, 0.01])
+    assert facing(OUT, 30, beside, 30, np.array([1.5, 0.0, 0.0])) == (30, 30)
