@@ -24,6 +24,7 @@ from tqdm import tqdm
 from hw_profiles.errors import RTLogError
 
 PR_SET_PDEATHSIG = 1  # of Linux
+tqdm.monitor_interval = 0  # else it would keep a thread, and threads do not get along with forks
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -33,6 +34,8 @@ class Workers:
     """`jobs` processes, or with one job this one."""
 
     def __init__(self, jobs: int) -> None:
+        if jobs > 1:
+            gc.freeze()  # what is there stays: who is forked need neither look at it nor copy it
         fork = multiprocessing.get_context("fork")
         self._pool = ProcessPoolExecutor(jobs, fork, _end_with_the_program) if jobs > 1 else None
         self._jobs = jobs
@@ -47,7 +50,6 @@ class Workers:
             results: Iterator[Result] = map(function, items)
         else:
             with _deaf_children():
-                gc.freeze()  # what is there stays: who is forked need neither look at it nor copy it
                 results = self._pool.map(function, items, chunksize=max(1, len(items) // (32 * self._jobs)))
         return _told(tqdm(results, total=len(items), desc=label, disable=None, leave=False))
 
@@ -68,6 +70,7 @@ class Workers:
     def begin_groups(
         self, label: str, function: Callable[[Item], Result], groups: Iterable[Iterable[Item]]
     ) -> Iterator[list[Result]]:
+        """As `begin`, of groups."""
         listed = [list(group) for group in groups]
         results = self.begin(label, function, [item for group in listed for item in group])
         return (list(islice(results, len(group))) for group in listed)
