@@ -89,6 +89,8 @@ def join_scans(recording: Path, parts: Sequence[ReadScans], scratch: Path) -> Sc
         RTLogError: the disk is full.
     """
     settings = {key: setting for part in parts for key, setting in part.settings.items()}
+    if not settings:
+        raise BadInputError(f"{recording}: holds none of the scans that its index counts")
     if len(settings) > 1:
         raise BadInputError(
             f"{recording}: the scanner's angles change within the recording; record each setting by itself"
