@@ -3,7 +3,7 @@
 In: the runs as they were mapped, and where their pieces lie. Out: lines for `build`, `info` and atlas.json.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,11 +53,15 @@ def _remark_parts(runs: list["DrivenRun"], placed: Placement) -> list[str]:
     members = defaultdict(list)
     for number, driven in enumerate(runs):
         members[of_run[number]].append(driven.run.run_id)
+    epcs = [{found.epc for found in driven.passes} for driven in runs]
+    passed_by = Counter(epc for of in epcs for epc in of)
     out = []
     for number, driven in enumerate(runs):
-        tags, alone = len({found.epc for found in driven.passes}), len(members[of_run[number]]) == 1
+        tags, alone = len(epcs[number]), len(members[of_run[number]]) == 1
         if alone and (tags < 2 or len(runs) > 1):
             shares = f"passed {tags} tag{'s' * (tags != 1)}" if tags < 2 else "shares no tag with the others"
+            if tags > 1 and any(passed_by[epc] > 1 for epc in epcs[number]):
+                shares = "saw no walls like the others' at the tags that they share"
             out.append(f"run {driven.run.run_id} {shares}: it is mapped alone")
         elif tags < 2:
             out.append(

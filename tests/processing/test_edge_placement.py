@@ -126,6 +126,9 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     placement = place_by_frames(pieces, graph, match_scans, Workers(1))
     assert len(placement.remarks) == 1
     assert "2 unconnected parts" in placement.remarks[0]
+    assert "run small-back shares no tag with the others: it is mapped alone" in remarks(runs, placement)
+    told = "run small-back saw no walls like the others' at the tags that they share: it is mapped alone"
+    assert told in remarks(driven, placement)  # the same, had they been the same tags
     extents = []
     for part, run in ((0, 0), (1, 1)):
         members = [piece for piece in placement.pieces if piece.part == part]
