@@ -37,7 +37,11 @@ def solve_once(poses: np.ndarray, links: Links, **how: Any) -> Solution:
     return solve(poses, without_kernel(links), **{**how, "max_iterations": 1})
 
 
-SQUARES = {"processing.frame_assembly.CORNER": NEVER, "processing.frame_assembly.GRADUAL": (NEVER,)}
+SQUARES = {
+    "processing.frame_assembly.CORNER": NEVER,
+    "processing.frame_assembly.GRADUAL": (NEVER,),
+    "processing.linked_paths.CORNER": NEVER,
+}
 
 
 @dataclass(frozen=True)

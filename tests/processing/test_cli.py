@@ -203,3 +203,27 @@ def test_a_program_that_is_killed_takes_its_processes_along(
         assert process.wait(timeout=10) == -signal.SIGKILL
         assert_alone(process.pid)
     assert not (tmp_path / "a.atlas").exists()
+
+
+SWALLOWING = """
+import os, signal, sys, time
+from processing import cli
+
+class Loading:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)
+
+def verb(args):
+    Loading()
+    time.sleep(60)
+
+cli._info = verb
+sys.exit(cli.main(["info", "any.atlas"]))
+"""
+
+
+def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
+    command = [sys.executable, "-c", SWALLOWING]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert (result.returncode, result.stderr) == (130, "rtlog-atlas: interrupted\n")
