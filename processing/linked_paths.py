@@ -41,12 +41,12 @@ def _groups_of(number: int, piece: SolvedPiece) -> list[Group]:
     found, links = piece.map, piece.map.links
     path = np.searchsorted(found.firsts, links.ends, side="right") - 1
     count = len(found.firsts) - 1
-    joined = path[links.robust]
-    _, label = connected_components(coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(count, count)))
-    if label.max() == 0:
+    joined = path[links.robust & (path[:, 0] != path[:, 1])]
+    groups_count, label = connected_components(coo_array((np.ones(len(joined)), tuple(joined.T)), shape=(count, count)))
+    if groups_count == 1:
         return [Group(piece, number, np.arange(len(found.poses)))]
     groups = []
-    for group in range(label.max() + 1):
+    for group in range(groups_count):
         paths = np.flatnonzero(label == group)
         rows = np.concatenate([np.arange(found.firsts[p], found.firsts[p + 1]) for p in paths])
         place = np.full(len(found.poses), -1)
@@ -112,11 +112,10 @@ def merge_groups(
 ) -> list[SolvedPiece]:
     """The pieces with their poses as those of their groups have come out, in `placed`, in one frame."""
     merged = []
-    for number, piece in enumerate(solved):
-        poses = piece.map.poses.copy()
-        for group, at in zip(groups, placed, strict=True):
-            if group.piece == number:
-                poses[group.rows] = at.map.poses
+    all_poses = [piece.map.poses.copy() for piece in solved]
+    for group, at in zip(groups, placed, strict=True):
+        all_poses[group.piece][group.rows] = at.map.poses
+    for piece, poses in zip(solved, all_poses, strict=True):
         squares = squared_distances(poses, piece.map.links)
         weights = robust_weights(squares, piece.map.links.robust, CORNER)
         solution = replace(piece.map.solution, poses=poses, squared_distances=squares, weights=weights)
