@@ -74,8 +74,8 @@ CHOSEN = """## What was chosen, and why
 Written by hand from the tables above.
 
 - **Matcher: point-to-line.** In rough rock `psm` makes as good a map; on two_drifts and in the straight drift it is
-  twice as far off, and a build takes up to five times as long. On the real log its chain alone is three times as far
-  off, which only the closed loops make good.
+  nearly or more than twice as far off, and a build takes up to five times as long. On the real log its chain alone is
+  three times as far off, which only the closed loops make good.
 - **Reference: a key frame every 0.75 m.** The chain alone drifts the more the nearer the reference is, for each match
   adds its error: most from scan to scan, which is the paper's way, least with key frames 1.5 m to 3 m apart. The
   closed map wants the opposite: links over 2, 4 and 8 m stiffen the chain anyway, and more key frames make more links

@@ -28,7 +28,7 @@ LEFT_OUT = {
     "two_drifts": REFERENCES + SOLVERS,
     "missed_tag": REFERENCES + SOLVERS,
     "straight": REFERENCES[:1],  # key frames 0.25 m apart are every scan there
-    "mine_level": (*REFERENCES[:2], REFERENCES[3], *SOLVERS),
+    "mine_level": REFERENCES + SOLVERS,
     "tunnels": REFERENCES + SOLVERS,
     "intel": ("assembly: `paper`", "method: `global`", REFERENCES[0]),
 }
