@@ -234,24 +234,44 @@ def _invert(first: Ints, rows: Ints, diagonal: Array, below: Array) -> Array:
     local = np.full(n, -1)
     for j in range(n - 1, -1, -1):
         start, count = first[j], first[j + 1] - first[j]
-        inner = np.linalg.inv(diagonal[j])
+        inner = _inverse_lower(diagonal[j])
         scaled = np.zeros((count, 3, 3))  # L_kj L_jj⁻¹
         for k in range(count):
-            scaled[k] = below[start + k] @ inner
+            _add_product(below[start + k], inner, 1.0, scaled[k])
             local[rows[start + k]] = k
         total = np.zeros((count, 3, 3))
         for k in range(count):  # Z_ij = -Σ_k Z_ik L_kj L_jj⁻¹
             row = rows[start + k]
-            total[k] -= on[row] @ scaled[k]
+            _add_product(on[row], scaled[k], -1.0, total[k])
             for q in range(first[row], first[row + 1]):
                 i = local[rows[q]]
                 if i >= 0:
-                    total[i] -= off[q] @ scaled[k]
-                    total[k] -= off[q].T @ scaled[i]
-        block = inner.T @ inner
+                    _add_product(off[q], scaled[k], -1.0, total[i])
+                    _add_product(off[q].T, scaled[i], -1.0, total[k])
+        _add_product(inner.T, inner, 1.0, on[j])
         for k in range(count):
             off[start + k] = total[k]
-            block = block - scaled[k].T @ total[k]
+            _add_product(scaled[k].T, total[k], -1.0, on[j])
             local[rows[start + k]] = -1
-        on[j] = block
     return on
+
+
+@njit(cache=True)
+def _inverse_lower(lower: Array) -> Array:
+    """The inverse of a lower triangle (3, 3)."""
+    out = np.zeros((3, 3))
+    for i in range(3):
+        out[i, i] = 1.0 / lower[i, i]
+    out[1, 0] = -lower[1, 0] * out[0, 0] * out[1, 1]
+    out[2, 1] = -lower[2, 1] * out[1, 1] * out[2, 2]
+    out[2, 0] = -(lower[2, 0] * out[0, 0] + lower[2, 1] * out[1, 0]) * out[2, 2]
+    return out
+
+
+@njit(cache=True)
+def _add_product(a: Array, b: Array, sign: float, out: Array) -> None:
+    """out += sign · a b, of 3 × 3: written out, for a call to a library costs more than ten such products."""
+    for i in range(3):
+        u, v, w = sign * a[i, 0], sign * a[i, 1], sign * a[i, 2]
+        for j in range(3):
+            out[i, j] += u * b[0, j] + v * b[1, j] + w * b[2, j]

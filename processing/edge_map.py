@@ -36,6 +36,8 @@ FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this shar
 LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
 GRADUAL = (1e7, 1e6, 1e5, 1e4, 1e3, 1e2, CORNER)
 MAX_ROUNDS = 5
+SAME_GUESS = (0.01, 0.01, 0.002)  # m, m, rad: from guesses closer than this a match finds the same
+RECENT_PATHS = 3  # so many paths before a new one still move with it; older ones wait for the whole to be solved
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
 TAG_M, TAG_RAD = 3.0, 0.5  # how well a tag alone joins two paths
@@ -138,6 +140,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
     strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
         drift = Drift.of(paths[path].start_doubt_m, LOST_RAD if paths[path].start_doubt_m else 0.0)
+        held = frames.drive < path - RECENT_PATHS
         for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
             if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
@@ -145,12 +148,12 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 drift = drift.after(onward)
             old = np.flatnonzero(present)
             present[stretch] = True
-            found, poses, lost = _close(frames, poses, links + loops, stretch, old, present, strayed, drift)
+            found, poses, lost = _close(frames, poses, links + loops, stretch, old, present, held, strayed, drift)
             if lost:
                 drift = Drift.of(LOST_M, LOST_RAD)
             loops = loops + found
             if len(found):
-                poses = _solve_present(poses, links + loops, present)
+                poses = _solve_present(poses, links + loops, present, held)
                 anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
                 drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
             strayed[stretch] = drift.radius_m, drift.radius_rad
@@ -164,6 +167,7 @@ def _close(
     stretch: Ints,
     old: Ints,
     present: NDArray[np.bool_],
+    held: NDArray[np.bool_],
     strayed: Array,
     drift: Drift,
 ) -> tuple[Links, Array, bool]:
@@ -180,7 +184,7 @@ def _close(
             if lost and not len(found):
                 break
             if len(found):
-                tried = _solve_present(poses, links + found, present, GRADUAL)
+                tried = _solve_present(poses, links + found, present, held, GRADUAL)
         pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
         closed = match_pairs(frames, tried, pairs, LOOP_INLIERS, between_drives=True)
         if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
@@ -189,37 +193,65 @@ def _close(
 
 
 def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> PieceMap:
-    """Search all loops anew from the solved poses, until the set of links no longer changes."""
-    everything = np.arange(len(poses))
-    known: set[tuple[int, int]] = set()
+    """Search all loops anew from the solved poses, until the set of links no longer changes.
+
+    What was matched from nearly the same guess is not matched again.
+    """
+    everything, loops = np.arange(len(poses)), NO_LINKS
+    tried, guesses = np.zeros((0, 2), np.int64), np.zeros((0, 3))
     for _ in range(MAX_ROUNDS):
         pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-        loops = match_pairs(frames, poses, pairs, LOOP_INLIERS, between_drives=True)
+        guess = relative(poses[pairs[:, 0]], poses[pairs[:, 1]])
+        where = find_rows(pairs, tried)
+        moved = np.abs(guess - guesses[where]) if len(tried) else np.full(guess.shape, np.inf)
+        again = (where < 0) | np.any(moved > SAME_GUESS, axis=1)
+        known = {tuple(ends) for ends in loops.ends.tolist()}
+        kept = find_rows(loops.ends, pairs[~again]) >= 0
+        loops = loops[np.flatnonzero(kept)] + match_pairs(frames, poses, pairs[again], LOOP_INLIERS, True)
+        guess[~again] = guesses[where[~again]]
+        tried, guesses = pairs, guess
         solution = solve(poses, links + loops)
         poses = solution.poses
-        kept = {(int(i), int(j)) for i, j in loops.ends}
-        if len(kept ^ known) <= 0.02 * len(kept):
+        found = {tuple(ends) for ends in loops.ends.tolist()}
+        if len(found ^ known) <= 0.02 * len(found):
             break
-        known = kept
     believed = (links + loops)[np.flatnonzero(solution.weights >= DOUBTED)]
     solution = solve(poses, believed)
     return PieceMap(solution.poses, firsts, believed, solution)
 
 
+def find_rows(rows: Ints, among: Ints) -> Ints:
+    """Where each of the rows (n, 2) stands among others (m, 2), which are sorted; -1: nowhere."""
+    if not len(among):
+        return np.full(len(rows), -1)
+    width = 1 + max(int(among.max()), int(rows.max(initial=0)))
+    keys, wanted = among @ [width, 1], rows @ [width, 1]
+    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[at] == wanted, at, -1)
+
+
 def _solve_present(
-    poses: Array, links: Links, present: NDArray[np.bool_], corners: tuple[float, ...] = (CORNER,)
+    poses: Array,
+    links: Links,
+    present: NDArray[np.bool_],
+    held: NDArray[np.bool_],
+    corners: tuple[float, ...] = (CORNER,),
 ) -> Array:
-    """Solve for the key frames that are there already; the others wait. With falling corners (graduated non-convexity),
-    links that are far from fulfilled at first get their chance before they are doubted.
+    """Solve for the key frames that are there already; the others wait, and those that are held stay where they are.
+
+    With falling corners (graduated non-convexity), links that are far from fulfilled at first get their chance before
+    they are doubted.
     """
     numbers = np.cumsum(present) - 1
-    inside = np.flatnonzero(np.all(present[links.ends], axis=1))
+    inside = np.flatnonzero(np.all(present[links.ends], axis=1) & ~np.all(held[links.ends], axis=1))
     part = links[inside]
     part = Links(numbers[part.ends], part.motions, part.informations, part.robust)
+    fixed = held[present]
+    fixed[0] = True
     solved = poses.copy()
     for corner in corners:
-        solved[present] = solve(solved[present], part, corner=corner, max_iterations=4).poses
+        solved[present] = solve(solved[present], part, fixed, corner, max_iterations=4).poses
     return solved
 
 

@@ -31,6 +31,7 @@ HOP_INLIERS = 0.6
 LOOP_RADIUS_M = 2.5  # Δr_max
 LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
 LOOP_INLIERS = 0.6
+MOST_LOOPS = 4  # of one key frame: where a drift was driven forty times, more would tell nothing new
 UNSEEN_M = 1.0  # a motion known no better than this was not seen
 TILT_M, TILT_RAD = 0.02, 0.02
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
@@ -90,7 +91,7 @@ def _neighbours(poses: Array, i: int) -> Ints:
 
 def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: float) -> Ints:
     """Pairs (p, 2) of a new key frame and the old one with the nearest view on every stretch of drive within the
-    radius.
+    radius; of many drives, on the nearest MOST_LOOPS.
     """
     if len(old) == 0 or len(new) == 0:
         return np.empty((0, 2), np.int64)
@@ -105,8 +106,11 @@ def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: 
         if len(candidates) == 0:
             continue
         breaks = (np.diff(candidates) > 3) | (np.diff(frames.drive[candidates]) != 0)
-        for stretch in np.split(candidates, np.flatnonzero(breaks) + 1):
-            pairs.append((nearest(views, stretch, i), i))
+        stretch = np.append(0, np.cumsum(breaks))
+        away = np.hypot(*(views[candidates] - views[i]).T)
+        best = np.lexsort((away, stretch))[np.append(0, np.flatnonzero(breaks) + 1)]  # of each stretch the nearest
+        best = np.sort(best[np.argsort(away[best], kind="stable")[:MOST_LOOPS]])
+        pairs += [(k, i) for k in candidates[best].tolist()]
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from processing.edge_map import MAX_DRIFT_M, MAX_DRIFT_RAD, Drift, Path, map_piece
+from processing.edge_map import MAX_DRIFT_M, MAX_DRIFT_RAD, RECENT_PATHS, Drift, Path, find_rows, map_piece
 from processing.geometry import accumulate, align, compose, relative, wrap_angle
 from processing.graph import Graph
 from processing.open_loop import mount_pose
@@ -193,3 +193,27 @@ def test_a_match_that_says_nothing_is_no_link() -> None:
     assert not worth_a_link(replace(sure, covariance=np.diag([1e4, 1e4, 1e-6])), 0.6)
     assert not worth_a_link(replace(sure, inliers=0.5), 0.6)
     assert not worth_a_link(replace(sure, converged=False), 0.6)
+
+
+def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
+    """Older paths are held while a new one is fitted in, and move with all others in the end."""
+    path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
+    count = 60  # key frames: before the run meets its own beginning
+    first = replace(path, scans=path.scans[:count], keyframes=path.keyframes[:count])
+    first = replace(first, chain=path.chain[np.arange(count - 1)], wheels=path.wheels[np.arange(count - 1)])
+    rng, copies = np.random.default_rng(2), RECENT_PATHS + 4
+    starts = [np.zeros(3), *rng.normal(0, [0.3, 0.1, 0.02], (copies - 1, 3))]
+    bent = [turn_aside(first, 20 + k, 0.01 * (-1) ** k) for k in range(copies)]
+    piece = map_piece(
+        [replace(of, start=at) for of, at in zip(bent, starts, strict=True)], mount_pose(driven[0].run), match_scans
+    )
+    assert off(piece.poses, np.tile(true[:count], (copies, 1))).max() < 0.1
+
+
+def test_rows_are_found_among_sorted_ones() -> None:
+    rng = np.random.default_rng(4)
+    among = np.unique(rng.integers(0, 30, (80, 2)), axis=0)
+    rows = rng.integers(0, 30, (200, 2))
+    expected = [next((k for k, row in enumerate(among.tolist()) if row == wanted), -1) for wanted in rows.tolist()]
+    assert find_rows(rows, among).tolist() == expected
+    assert find_rows(rows[:2], np.zeros((0, 2), np.int64)).tolist() == [-1, -1]
