@@ -63,6 +63,7 @@ def condense_all(solved: list[SolvedPiece], boundary: Boundary, work: Workers) -
             (of.poses, of.links, of.solution.weights, np.array(indices, np.int64), np.array(variables, np.int64))
             for of, indices, variables in zip(maps, boundary.indices, boundary.variables, strict=True)
         ],
+        at_once=10,
     )
 
 
@@ -112,7 +113,7 @@ def bend(
         guess, fixed = compose(frame, piece.map.poses), np.zeros(len(piece.map.poses), bool)
         guess[indices], fixed[indices] = poses[variables], True
         tasks.append((guess, piece.map.links, fixed))
-    solutions: list[Solution] = work.starmap("assembly", solve, tasks)
+    solutions: list[Solution] = work.starmap("assembly", solve, tasks, at_once=10)
     return [
         replace(piece, map=replace(piece.map, poses=found.poses, solution=found))
         for piece, found in zip(solved, solutions, strict=True)

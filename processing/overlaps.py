@@ -78,7 +78,7 @@ def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[in
 def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers) -> Links:
     """Links between the key frames of overlaps, which join the boundary."""
     ends, motions, informations = [], [], []
-    matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps)
+    matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps, at_once=10)
     for overlap, found in zip(overlaps, matches, strict=True):
         p, q = overlap.numbers
         for (i, k), seen in zip(overlap.indices, found, strict=True):

@@ -40,8 +40,10 @@ class Workers:
         self._pool = ProcessPoolExecutor(jobs, fork, _end_with_the_program) if jobs > 1 else None
         self._jobs = jobs
 
-    def begin(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """The results, in order. Other processes are at work on them from now on.
+    def begin(
+        self, label: str, function: Callable[[Item], Result], items: Iterable[Item], at_once: int = 1
+    ) -> Iterator[Result]:
+        """The results, in order. Other processes are at work on them from now on; small ones go there `at_once`.
 
         Raises: RTLogError: a process died; whatever `function` raises.
         """
@@ -49,17 +51,22 @@ class Workers:
         if self._pool is None or len(items) < 2:
             results: Iterator[Result] = map(function, items)
         else:
+            chunk = max(1, min(at_once, len(items) // (4 * self._jobs)), len(items) // (32 * self._jobs))
             with _deaf_children():
-                results = self._pool.map(function, items, chunksize=max(1, len(items) // (32 * self._jobs)))
+                results = self._pool.map(function, items, chunksize=chunk)
         return _told(tqdm(results, total=len(items), desc=label, disable=None, leave=False))
 
-    def map(self, label: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    def map(
+        self, label: str, function: Callable[[Item], Result], items: Iterable[Item], at_once: int = 1
+    ) -> list[Result]:
         """As `begin`, all of them."""
-        return list(self.begin(label, function, items))
+        return list(self.begin(label, function, items, at_once))
 
-    def starmap(self, label: str, function: Callable[..., Result], items: Iterable[tuple[Any, ...]]) -> list[Result]:
+    def starmap(
+        self, label: str, function: Callable[..., Result], items: Iterable[tuple[Any, ...]], at_once: int = 1
+    ) -> list[Result]:
         """The same; every item holds all arguments."""
-        return self.map(label, partial(_apply, function), items)
+        return self.map(label, partial(_apply, function), items, at_once)
 
     def map_groups(
         self, label: str, function: Callable[[Item], Result], groups: Iterable[Iterable[Item]]
