@@ -4,7 +4,8 @@ In: poses (N, 3) as a first guess, links between them with their information mat
 links best, and how badly each link fits. Pose 0, or those said to be fixed, hold the frame.
 
 The cost of a link is the square of its Mahalanobis distance d up to a corner, and grows no further (Geman–McClure, of
-which every cost is the limit: weight (c / (c + d²))²). Weak links, the chain of the drive itself, are never doubted.
+which every cost is the limit: weight (c / (c + d²))²). Only links that say so are doubted: not those of the wheels,
+which hold a drive together where a match in its chain was wrong.
 """
 
 import math
