@@ -64,8 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("log", type=Path, metavar="LOG")
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="RUN.mcap")
 
-    for number in (signal.SIGTERM, signal.SIGALRM):
-        signal.signal(number, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
     sys.unraisablehook = _interrupt_again
     return run_verbs(parser, argv)
 
@@ -78,6 +77,7 @@ def _interrupt(_number: int, _frame: object) -> None:
 def _interrupt_again(unraisable: "sys.UnraisableHookArgs") -> None:
     """An interrupt that hits a destructor is swallowed there: a compiler that loads has many. So another is sent."""
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        signal.signal(signal.SIGALRM, _interrupt)
         signal.setitimer(signal.ITIMER_REAL, 0.01)
     else:
         sys.__unraisablehook__(unraisable)

@@ -101,10 +101,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def signals() -> Iterator[None]:
-    """The commands take SIGTERM for themselves."""
-    handler = signal.getsignal(signal.SIGTERM)
+    """The commands take SIGTERM, and what destructors swallow, for themselves."""
+    handler, hook = signal.getsignal(signal.SIGTERM), sys.unraisablehook
     yield
     signal.signal(signal.SIGTERM, handler)
+    sys.unraisablehook = hook
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
