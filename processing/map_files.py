@@ -131,14 +131,8 @@ def band_rows(width: int) -> int:
     return max(1, BAND_CELLS // max(1, width))
 
 
-def write_map(folder: Path, image: MapImage | StoredImage, overlay: Overlay | None = None) -> None:
-    """Write map.pgm, map.yaml and map.png into the folder, which exists."""
-    write_image(folder, image)
-    write_picture(folder, image, overlay or Overlay())
-
-
 def write_image(folder: Path, image: MapImage | StoredImage) -> None:
-    """Write map.pgm and map.yaml."""
+    """Write map.pgm and map.yaml into the folder, which exists."""
     image = _not_empty(image)
     (height, width), step = image.shape, band_rows(image.shape[1])
     with (folder / "map.pgm").open("wb") as file:
@@ -154,7 +148,7 @@ def write_image(folder: Path, image: MapImage | StoredImage) -> None:
 
 
 def write_picture(folder: Path, image: MapImage | StoredImage, overlay: Overlay) -> None:
-    """Write map.png."""
+    """Write map.png into the folder."""
     draw_map(image, overlay).save(folder / "map.png")
 
 
@@ -166,7 +160,7 @@ def _not_empty(image: MapImage | StoredImage) -> MapImage | StoredImage:
 
 
 def read_map(folder: Path) -> MapImage:
-    """Read map.yaml and the image that it names, as `write_map` or nav2's map_saver wrote them.
+    """Read map.yaml and the image that it names, as `write_image` or nav2's map_saver wrote them.
 
     Raises:
         BadInputError: a file is missing or malformed, or the map is turned (an origin with a yaw) or negated.

@@ -125,10 +125,6 @@ def blur(covariance: Array) -> Array:
     return covariance + np.diag([TILT_M**2, TILT_M**2, TILT_RAD**2])
 
 
-def nearest(points: Array, candidates: Ints, i: int) -> int:
-    return int(candidates[np.argmin(np.hypot(*(points[candidates] - points[i]).T))])
-
-
 def match_vehicles(
     reference: Scan,
     current: Scan,

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from hw_profiles.errors import BadInputError
 from processing.comparison import compare_relations, compare_truth, table
 from processing.geometry import compose, relative, transform
-from processing.map_files import to_image, write_map
+from processing.map_files import to_image, write_image
 from processing.occupancy_grid import Grid
 from processing.tum import write_tum
 
@@ -53,7 +53,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     columns, rows = (np.floor(joined / 0.05) - low).astype(int).T
     log_odds = np.zeros((rows.max() + 1, columns.max() + 1), dtype=np.float32)
     log_odds[rows, columns] = 3
-    write_map(atlas, to_image(Grid(log_odds, 0.05, low * 0.05)))
+    write_image(atlas, to_image(Grid(log_odds, 0.05, low * 0.05)))
     listed = [{"id": run_id, "sha256": "", "ticks": 301, "profile": "p"} for run_id in MOVES]
     document = {"schema": 1, "runs": listed, "nodes": nodes, "edges": edges, "remarks": []}
     (atlas / "atlas.json").write_text(json.dumps(document))

@@ -20,7 +20,8 @@ from processing.map_files import (
     read_map,
     stitch_image,
     to_image,
-    write_map,
+    write_image,
+    write_picture,
 )
 from processing.occupancy_grid import Grid, store_grid
 from processing.stitching import stitch
@@ -37,7 +38,7 @@ def grid() -> Grid:
 
 
 def test_what_is_written_is_what_nav2_reads(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, to_image(grid))
+    write_image(tmp_path, to_image(grid))
     data = (tmp_path / "map.pgm").read_bytes()
     assert data.startswith(b"P5\n50 30\n255\n")
     assert len(data) == 13 + 50 * 30
@@ -48,7 +49,7 @@ def test_what_is_written_is_what_nav2_reads(tmp_path: Path, grid: Grid) -> None:
 
 
 def test_round_trip(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, to_image(grid))
+    write_image(tmp_path, to_image(grid))
     back = read_map(tmp_path)
     assert_array_equal(back.pixels, to_image(grid).pixels)
     assert (back.resolution_m, *back.origin) == (0.05, -1.25, 3.0)
@@ -64,13 +65,14 @@ def test_same_grid_same_bytes(tmp_path: Path, grid: Grid) -> None:
     )
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write_map(tmp_path / name, to_image(grid), overlay)
+        write_image(tmp_path / name, to_image(grid))
+        write_picture(tmp_path / name, to_image(grid), overlay)
     for file in ("map.pgm", "map.yaml", "map.png"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
 def test_empty_grid_is_written(tmp_path: Path) -> None:
-    write_map(tmp_path, to_image(Grid(np.zeros((0, 0), dtype=np.float32), 0.05, np.zeros(2))))
+    write_image(tmp_path, to_image(Grid(np.zeros((0, 0), dtype=np.float32), 0.05, np.zeros(2))))
     assert read_map(tmp_path).pixels.tolist() == [[UNKNOWN]]
 
 
@@ -111,7 +113,7 @@ def test_names_are_whole_also_at_the_rim(x: float) -> None:
     ],
 )
 def test_bad_maps_are_refused(tmp_path: Path, grid: Grid, change: tuple[str, str], complaint: str) -> None:
-    write_map(tmp_path, to_image(grid))
+    write_image(tmp_path, to_image(grid))
     path = tmp_path / "map.yaml"
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(BadInputError, match=complaint):
@@ -119,7 +121,7 @@ def test_bad_maps_are_refused(tmp_path: Path, grid: Grid, change: tuple[str, str
 
 
 def test_damaged_image_is_refused(tmp_path: Path, grid: Grid) -> None:
-    write_map(tmp_path, to_image(grid))
+    write_image(tmp_path, to_image(grid))
     (tmp_path / "map.pgm").write_bytes(b"P5\n50 30\n255\n\x00")
     with pytest.raises(BadInputError, match="map"):
         read_map(tmp_path)
@@ -142,14 +144,14 @@ def test_a_map_stitched_in_bands_is_the_whole_without_its_empty_rim(
         assert_array_equal(image.rows(slice(3, 5)), whole.pixels[low + 3 : low + 5, left:right])
         assert_allclose(image.origin, whole.origin + 0.05 * np.array([left, low]))
         (tmp_path / str(cells)).mkdir()
-        write_map(tmp_path / str(cells), image)
+        write_image(tmp_path / str(cells), image)
         assert_array_equal(read_map(tmp_path / str(cells)).pixels, image.rows(slice(None)))
         pictures.add((tmp_path / str(cells) / "map.png").read_bytes())
     assert len(pictures) == 1
     spot = np.zeros((40, 60), np.float32)
     spot[10:13, 20:25], spot[12, 22] = -1.0, 3.0
     image = stitch_image([Grid(spot, 0.1, np.array([-3.0, 2.0]))], np.zeros((1, 3)), tmp_path / "spot", work)
-    write_map(tmp_path, image)
+    write_image(tmp_path, image)
     assert image.shape == (3, 5)
     assert_allclose(read_map(tmp_path).occupied_points(), [[-0.75, 3.25]], atol=1e-6)
     nothing = Grid(np.zeros((4, 5), np.float32), 0.05, np.zeros(2))
