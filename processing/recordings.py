@@ -25,6 +25,7 @@ class Source:
     """A recording that is fit to be read, and what there is to know before it is."""
 
     parts: tuple[Path, ...]
+    cuts_ns: tuple[tuple[int, ...], ...]  # of each part: log times between which it can be read by itself
     info: LogInfo  # of all parts together
     profile: Profile
     scan_topic: str
@@ -78,7 +79,8 @@ def survey(parts: tuple[Path, ...], profile: Profile | None) -> Source:
     Raises:
         BadInputError: no recording, no laser in it, no odometry in it, no profile for its encoders.
     """
-    path, info = parts[0], _join([read_info(part) for part in parts])
+    infos = [read_info(part) for part in parts]
+    path, info = parts[0], _join(infos)
     profile = _profile(path, info, profile)
     scan_topic = next((topic for topic in SCAN_TOPICS if info.message_counts.get(topic)), None)
     if scan_topic is None:
@@ -93,15 +95,16 @@ def survey(parts: tuple[Path, ...], profile: Profile | None) -> Source:
         raise BadInputError(f"{path}: {scan_topic} holds 1 scan; a drive needs more")
     if encoder_topic == JOINT_STATES.name and not profile.encoders:
         raise BadInputError(f"{path}: has encoders but no profile that explains them; name one with --profile")
-    return Source(parts, info, profile, scan_topic, encoder_topic)
+    cuts_ns = tuple(part.cuts_ns for part in infos)
+    return Source(parts, cuts_ns, info, profile, scan_topic, encoder_topic)
 
 
 def cut_windows(source: Source) -> list[Window]:
     """All of a recording, so that several processes can read it."""
     spans = [
         (path, start, end)
-        for path in source.parts
-        for start, end in pairwise([0, *read_info(path).cuts_ns, FOREVER_NS])
+        for path, cuts_ns in zip(source.parts, source.cuts_ns, strict=True)
+        for start, end in pairwise([0, *cuts_ns, FOREVER_NS])
     ]
     return [Window(source, number, *span) for number, span in enumerate(spans)]
 
