@@ -237,21 +237,21 @@ def _invert(first: Ints, rows: Ints, diagonal: Array, below: Array) -> Array:
         inner = _inverse_lower(diagonal[j])
         scaled = np.zeros((count, 3, 3))  # L_kj L_jj⁻¹
         for k in range(count):
-            _add_product(below[start + k], inner, 1.0, scaled[k])
+            add_product(below[start + k], inner, 1.0, scaled[k])
             local[rows[start + k]] = k
         total = np.zeros((count, 3, 3))
         for k in range(count):  # Z_ij = -Σ_k Z_ik L_kj L_jj⁻¹
             row = rows[start + k]
-            _add_product(on[row], scaled[k], -1.0, total[k])
+            add_product(on[row], scaled[k], -1.0, total[k])
             for q in range(first[row], first[row + 1]):
                 i = local[rows[q]]
                 if i >= 0:
-                    _add_product(off[q], scaled[k], -1.0, total[i])
-                    _add_product(off[q].T, scaled[i], -1.0, total[k])
-        _add_product(inner.T, inner, 1.0, on[j])
+                    add_product(off[q], scaled[k], -1.0, total[i])
+                    add_product(off[q].T, scaled[i], -1.0, total[k])
+        add_product(inner.T, inner, 1.0, on[j])
         for k in range(count):
             off[start + k] = total[k]
-            _add_product(scaled[k].T, total[k], -1.0, on[j])
+            add_product(scaled[k].T, total[k], -1.0, on[j])
             local[rows[start + k]] = -1
     return on
 
@@ -269,7 +269,7 @@ def _inverse_lower(lower: Array) -> Array:
 
 
 @njit(cache=True)
-def _add_product(a: Array, b: Array, sign: float, out: Array) -> None:
+def add_product(a: Array, b: Array, sign: float, out: Array) -> None:
     """out += sign · a b, of 3 × 3: written out, for a call to a library costs more than ten such products."""
     for i in range(3):
         u, v, w = sign * a[i, 0], sign * a[i, 1], sign * a[i, 2]

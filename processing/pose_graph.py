@@ -15,7 +15,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from processing.block_cholesky import Pattern, factorise, find_pattern, inverse_blocks, solve_factors, whiten
+from processing.block_cholesky import (
+    Pattern,
+    add_product,
+    factorise,
+    find_pattern,
+    inverse_blocks,
+    solve_factors,
+    whiten,
+)
 from processing.geometry import relative, relative_jacobians, wrap_angle
 
 Array = NDArray[np.float64]
@@ -118,14 +126,6 @@ def normal_equations(poses: Array, links: Links, weights: Array, pattern: Patter
 
 
 @njit(cache=True)
-def _add_product(a: Array, b: Array, out: Array) -> None:
-    """out += aᵀ b, of 3 × 3."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] += a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
-
-
-@njit(cache=True)
 def _add_moved(a: Array, b: Array, out: Array) -> None:
     """out += aᵀ b, of a vector b (3,)."""
     for i in range(3):
@@ -145,7 +145,6 @@ def _assemble(
     below: Array,
     gradient: Array,
 ) -> None:
-    # Small matrices are written out: a product of two 3 × 3 arrays costs more than ten such loops.
     j_a, j_b, error = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     i_a, i_b, pull = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     j_a[2, 2], j_b[2, 2] = -1.0, 1.0
@@ -171,16 +170,16 @@ def _assemble(
                 i_a[i, j] = u * j_a[0, j] + v * j_a[1, j] + w * j_a[2, j]
                 i_b[i, j] = u * j_b[0, j] + v * j_b[1, j] + w * j_b[2, j]
         if p >= 0:
-            _add_product(j_a, i_a, diagonal[p])
+            add_product(j_a.T, i_a, 1.0, diagonal[p])
             _add_moved(j_a, pull, gradient[p])
         if q >= 0:
-            _add_product(j_b, i_b, diagonal[q])
+            add_product(j_b.T, i_b, 1.0, diagonal[q])
             _add_moved(j_b, pull, gradient[q])
         if slots[k] >= 0:
             if p > q:
-                _add_product(j_a, i_b, below[slots[k]])
+                add_product(j_a.T, i_b, 1.0, below[slots[k]])
             else:
-                _add_product(j_b, i_a, below[slots[k]])
+                add_product(j_b.T, i_a, 1.0, below[slots[k]])
 
 
 def solve(
