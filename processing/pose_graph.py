@@ -73,9 +73,12 @@ class Solution:
     poses: Array  # (N, 3)
     squared_distances: Array  # (m,) Mahalanobis, of each link
     weights: Array  # (m,) 1 = believed, 0 = doubted
-    chi2: float
     iterations: int
     converged: bool
+
+    @property
+    def chi2(self) -> float:
+        return float(self.squared_distances.sum())
 
 
 CORNER = 16.0  # squared Mahalanobis distance at which a strong link is half doubted: p = 0.001 for three degrees
@@ -222,7 +225,7 @@ def solve(
         else:
             break
     weights = robust_weights(squares, links.robust, corner)
-    return Solution(poses, squares, weights, float(squares.sum()), iteration, converged)
+    return Solution(poses, squares, weights, iteration, converged)
 
 
 def _cost(squares: Array, links: Links, corner: float) -> float:
