@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry import accumulate, relative
+from processing.geometry import accumulate, relative, wrap_angle
 from processing.pose_graph import CORNER, Links, Solution, solve
 from processing.relocation import NO_LINKS, relocate_stretch
 from processing.scan_matching import Matcher
@@ -204,8 +204,10 @@ def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> Piec
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
         guess = relative(poses[pairs[:, 0]], poses[pairs[:, 1]])
         where = find_rows(pairs, tried)
-        moved = np.abs(guess - guesses[where]) if len(tried) else np.full(guess.shape, np.inf)
-        again = (where < 0) | np.any(moved > SAME_GUESS, axis=1)
+        again = where < 0
+        moved = guess[~again] - guesses[where[~again]]
+        moved[:, 2] = wrap_angle(moved[:, 2])  # drives both ways lie half a turn apart
+        again[~again] = np.any(np.abs(moved) > SAME_GUESS, axis=1)
         known = {tuple(ends) for ends in loops.ends.tolist()}
         kept = find_rows(loops.ends, pairs[~again]) >= 0
         loops = loops[np.flatnonzero(kept)] + match_pairs(frames, poses, pairs[again], LOOP_INLIERS, True)
