@@ -30,9 +30,7 @@ class Span:
     last: int
     start: int | None  # node at the first scan
     end: int | None  # node at the last scan
-    reaches_m: tuple[float, float] = field(
-        default=(0.0, 0.0), compare=False
-    )  # how far the tags of these nodes are read
+    reaches_m: tuple[float, float] = field(default=(0.0, 0.0), compare=False)  # how far those nodes' tags are read
 
 
 @dataclass(frozen=True, slots=True)

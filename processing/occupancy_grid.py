@@ -158,9 +158,7 @@ def _find_ends(
 
 @numba.njit(cache=True)
 def _trace(
-    state: NDArray[
-        np.int32
-    ],  # (H, W), in place: steps above LOWEST, and 256 times the last scan that spoke of the cell
+    state: NDArray[np.int32],  # (H, W), in place: steps above LOWEST, and 256 times the last scan that spoke of it
     starts: Array,  # (n, 2) of the laser, in cells
     ends: Array,  # (n, B, 2) of the beams
     kinds: NDArray[np.int8],  # (n, B)

@@ -48,9 +48,7 @@ class Run:
     sha256: str
     profile: Profile
     scans: Scans
-    scan_ticks: NDArray[
-        np.int64
-    ]  # (n,) the tick of each scan, counted from the recording's first; its own number without ticks
+    scan_ticks: Stamps  # (n,) the tick of each scan, counted from the recording's first; without ticks its own number
     epoch_ns: int  # where times count from
     motion_ns: Stamps  # (m,) stamps of the encoders or of /odom
     motion_times: Array  # (m,) s, strictly rising

@@ -102,9 +102,7 @@ def join_scans(recording: Path, parts: Sequence[ReadScans], scratch: Path) -> Sc
     beams = ranges.shape[1]
     if beams < 10:
         raise BadInputError(f"{recording}: scans of {beams} beams cannot be matched")
-    if (
-        increment < 0
-    ):  # a scanner mounted upside down, or a driver that counts clockwise: the first ray is the last beam
+    if increment < 0:  # mounted upside down, or a driver that counts clockwise: the first ray is the last beam
         start, increment, time_increment = start + increment * (beams - 1), -increment, -time_increment
         ranges = ranges.mirrored()
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
