@@ -66,8 +66,12 @@ class RangeFile:
     """Writes the file. Scans shorter than the longest are padded with NaN."""
 
     def __init__(self, path: Path) -> None:
+        """Raises: RTLogError: there is no room, or the folder is gone."""
         self.path, self.rows, self.beams = path, 0, 0
-        self._file = path.open("w+b")
+        try:
+            self._file = path.open("w+b")
+        except OSError as error:
+            raise self._no_room(error) from error
 
     def append(self, ranges: Rows) -> None:
         """Append a scan (b,), or several (k, b). Raises: RTLogError: the disk is full."""

@@ -77,3 +77,5 @@ def test_a_file_that_is_lost_or_cut_short_is_told(tmp_path: Path) -> None:
     (tmp_path / "a").unlink()
     with pytest.raises(RTLogError, match="a: was lost while it was in use: No such file"):
         ranges[0]
+    with pytest.raises(RTLogError, match="TMPDIR"):
+        RangeFile(tmp_path / "gone" / "b")
