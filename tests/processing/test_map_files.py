@@ -145,6 +145,7 @@ def test_a_map_stitched_in_bands_is_the_whole_without_its_empty_rim(
         assert_allclose(image.origin, whole.origin + 0.05 * np.array([left, low]))
         (tmp_path / str(cells)).mkdir()
         write_image(tmp_path / str(cells), image)
+        write_picture(tmp_path / str(cells), image, Overlay())
         assert_array_equal(read_map(tmp_path / str(cells)).pixels, image.rows(slice(None)))
         pictures.add((tmp_path / str(cells) / "map.png").read_bytes())
     assert len(pictures) == 1
