@@ -37,7 +37,7 @@ LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where i
 GRADUAL = (1e7, 1e6, 1e5, 1e4, 1e3, 1e2, CORNER)
 MAX_ROUNDS = 5
 SAME_GUESS = (0.01, 0.01, 0.002)  # m, m, rad: from guesses closer than this a match finds the same
-RECENT_PATHS = 3  # so many paths before a new one still move with it; older ones wait for the whole to be solved
+RECENT_PATHS = 6  # so many paths before a new one still move with it; older ones wait for the whole to be solved
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
 TAG_M, TAG_RAD = 3.0, 0.5  # how well a tag alone joins two paths
@@ -153,7 +153,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 drift = Drift.of(LOST_M, LOST_RAD)
             loops = loops + found
             if len(found):
-                poses = _solve_present(poses, links + loops, present, held)
+                poses = solve_present(poses, links + loops, present, held)
                 anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
                 drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
             strayed[stretch] = drift.radius_m, drift.radius_rad
@@ -184,7 +184,7 @@ def _close(
             if lost and not len(found):
                 break
             if len(found):
-                tried = _solve_present(poses, links + found, present, held, GRADUAL)
+                tried = solve_present(poses, links + found, present, held, GRADUAL)
         pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
         closed = match_pairs(frames, tried, pairs, LOOP_INLIERS, between_drives=True)
         if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
@@ -233,7 +233,7 @@ def find_rows(rows: Ints, among: Ints) -> Ints:
     return np.where(keys[at] == wanted, at, -1)
 
 
-def _solve_present(
+def solve_present(
     poses: Array,
     links: Links,
     present: NDArray[np.bool_],

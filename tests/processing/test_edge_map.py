@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from processing.edge_map import MAX_DRIFT_M, MAX_DRIFT_RAD, RECENT_PATHS, Drift, Path, find_rows, map_piece
+from processing.edge_map import (
+    MAX_DRIFT_M,
+    MAX_DRIFT_RAD,
+    RECENT_PATHS,
+    Drift,
+    Path,
+    find_rows,
+    map_piece,
+    solve_present,
+)
 from processing.geometry import accumulate, align, compose, relative, wrap_angle
 from processing.graph import Graph
 from processing.open_loop import mount_pose
@@ -208,6 +217,19 @@ def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRu
         [replace(of, start=at) for of, at in zip(bent, starts, strict=True)], mount_pose(driven[0].run), match_scans
     )
     assert off(piece.poses, np.tile(true[:count], (copies, 1))).max() < 0.1
+
+
+def test_held_poses_stay_and_waiting_ones_wait() -> None:
+    """Links say 1 m from pose to pose; the third is not there yet, the second is held 0.2 m too far."""
+    poses = np.array([[0.0, 0, 0], [1.2, 0, 0], [9, 9, 0], [5, 1, 0.3]])
+    step = np.array([[1.0, 0, 0]] * 3)
+    links = Links.of(np.array([[0, 1], [1, 2], [1, 3]]), step, np.tile(np.eye(3), (3, 1, 1)), robust=False)
+    here, held = np.array([True, True, False, True]), np.array([False, True, False, False])
+    assert_allclose(
+        solve_present(poses, links, here, held), [[0, 0, 0], [1.2, 0, 0], [9, 9, 0], [2.2, 0, 0]], atol=1e-9
+    )
+    free = solve_present(poses, links, here, np.zeros(4, bool))
+    assert_allclose(free, [[0, 0, 0], [1, 0, 0], [9, 9, 0], [2, 0, 0]], atol=1e-9)
 
 
 def test_rows_are_found_among_sorted_ones() -> None:
