@@ -253,7 +253,7 @@ def solve_present(
     fixed[0] = True
     solved = poses.copy()
     for corner in corners:
-        solved[present] = solve(solved[present], part, fixed, corner, max_iterations=4).poses
+        solved[present] = solve(solved[present], part, fixed=fixed, corner=corner, max_iterations=4).poses
     return solved
 
 

@@ -1,4 +1,4 @@
-"""Worlds that nothing was tuned on: one of each of six topologies, drawn by number, mapped and held against the law of
+"""Random worlds, drawn by number, of five topologies, mapped and held against the law of
 `tests/benchmarks/random_worlds.py`. Each of these numbers has once broken the mapper.
 """
 
