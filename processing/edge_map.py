@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry import accumulate, relative, wrap_angle
-from processing.pose_graph import CORNER, Links, Solution, solve
-from processing.relocation import NO_LINKS, relocate_stretch
+from processing.geometry import accumulate, relative
+from processing.known_matches import Matches, match_loops
+from processing.pose_graph import CORNER, NO_LINKS, Links, Solution, solve
+from processing.relocation import relocate_stretch
 from processing.scan_matching import Matcher
 from processing.strong_links import (
+    FIRST_DRIVES,
     HOP_INLIERS,
-    LOOP_INLIERS,
     LOOP_RADIUS_M,
     KeyFrames,
     hop_pairs,
@@ -36,8 +37,6 @@ FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this shar
 LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
 GRADUAL = (1e7, 1e6, 1e5, 1e4, 1e3, 1e2, CORNER)
 MAX_ROUNDS = 5
-SAME_GUESS = (0.01, 0.01, 0.002)  # m, m, rad: from guesses closer than this a match finds the same
-RECENT_PATHS = 6  # so many paths before a new one still move with it; older ones wait for the whole to be solved
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
 TAG_M, TAG_RAD = 3.0, 0.5  # how well a tag alone joins two paths
@@ -135,12 +134,12 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         + _joins(paths, firsts)
         + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS, between_drives=False)
     )
-    loops = NO_LINKS
+    loops, known = NO_LINKS, Matches.none()
     present = np.zeros(len(poses), bool)
     strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
         drift = Drift.of(paths[path].start_doubt_m, LOST_RAD if paths[path].start_doubt_m else 0.0)
-        held = frames.drive < path - RECENT_PATHS
+        held = (frames.drive < path) & (path >= FIRST_DRIVES)  # the first move with each other, until enough are there
         for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
             if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
@@ -148,16 +147,19 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 drift = drift.after(onward)
             old = np.flatnonzero(present)
             present[stretch] = True
-            found, poses, lost = _close(frames, poses, links + loops, stretch, old, present, held, strayed, drift)
-            if lost:
+            placed, closed, poses = _close(frames, poses, links + loops, stretch, old, present, held, strayed, drift)
+            if closed is None:
                 drift = Drift.of(LOST_M, LOST_RAD)
+            else:
+                known = known.joined(closed)
+            found = placed if closed is None else placed + closed.links
             loops = loops + found
             if len(found):
                 poses = solve_present(poses, links + loops, present, held)
                 anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
                 drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
             strayed[stretch] = drift.radius_m, drift.radius_rad
-    return _settle(frames, links, poses, firsts)
+    return _settle(frames, links, poses, firsts, known)
 
 
 def _close(
@@ -170,67 +172,45 @@ def _close(
     held: NDArray[np.bool_],
     strayed: Array,
     drift: Drift,
-) -> tuple[Links, Array, bool]:
-    """The loops that a new stretch closes, the poses with the stretch where it was found, and whether it is lost.
+) -> tuple[Links, Matches | None, Array]:
+    """Where a new stretch was found, the loops that it closes, and the poses with the stretch there; no matches: it is
+    lost.
 
     Where most pairs that should match do not, the stretch lies elsewhere, and the few that do are chance.
     """
     for radius_m, radius_rad in ((drift.radius_m, drift.radius_rad), (LOST_M, LOST_RAD)):
         lost = radius_m > drift.radius_m
-        found, tried = NO_LINKS, poses
+        placed, tried = NO_LINKS, poses
         if drift.is_astray or lost:
             surer = old[strayed[old, 0] < 0.5 * radius_m]
-            found = relocate_stretch(frames, poses, stretch, surer, radius_m, radius_rad)
-            if lost and not len(found):
+            placed = relocate_stretch(frames, poses, stretch, surer, radius_m, radius_rad)
+            if lost and not len(placed):
                 break
-            if len(found):
-                tried = solve_present(poses, links + found, present, held, GRADUAL)
-        pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
-        closed = match_pairs(frames, tried, pairs, LOOP_INLIERS, between_drives=True)
-        if len(pairs) < FEW or len(closed) >= LEAST_SHARE * len(pairs):
-            return found + closed, tried, False
-    return NO_LINKS, poses, True
+            if len(placed):
+                tried = solve_present(poses, links + placed, present, held, GRADUAL)
+        closed = match_loops(
+            frames, tried, loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M), known=Matches.none()
+        )
+        if len(closed.pairs) < FEW or len(closed.links) >= LEAST_SHARE * len(closed.pairs):
+            return placed, closed, tried
+    return NO_LINKS, None, poses
 
 
-def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints) -> PieceMap:
-    """Search all loops anew from the solved poses, until the set of links no longer changes.
-
-    What was matched from nearly the same guess is not matched again.
-    """
-    everything, loops = np.arange(len(poses)), NO_LINKS
-    tried, guesses = np.zeros((0, 2), np.int64), np.zeros((0, 3))
+def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints, loops: Matches) -> PieceMap:
+    """Search all loops anew from the solved poses, until the set of links no longer changes."""
+    everything = np.arange(len(poses))
     for _ in range(MAX_ROUNDS):
-        pairs = loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M)
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-        guess = relative(poses[pairs[:, 0]], poses[pairs[:, 1]])
-        where = find_rows(pairs, tried)
-        again = where < 0
-        moved = guess[~again] - guesses[where[~again]]
-        moved[:, 2] = wrap_angle(moved[:, 2])  # drives both ways lie half a turn apart
-        again[~again] = np.any(np.abs(moved) > SAME_GUESS, axis=1)
-        known = {tuple(ends) for ends in loops.ends.tolist()}
-        kept = find_rows(loops.ends, pairs[~again]) >= 0
-        loops = loops[np.flatnonzero(kept)] + match_pairs(frames, poses, pairs[again], LOOP_INLIERS, True)
-        guess[~again] = guesses[where[~again]]
-        tried, guesses = pairs, guess
-        solution = solve(poses, links + loops)
+        known = {tuple(ends) for ends in loops.links.ends.tolist()}
+        loops = match_loops(frames, poses, loop_pairs(frames, poses, everything, everything, LOOP_RADIUS_M), loops)
+        solution = solve(poses, links + loops.links)
         poses = solution.poses
-        found = {tuple(ends) for ends in loops.ends.tolist()}
+        found = {tuple(ends) for ends in loops.links.ends.tolist()}
         if len(found ^ known) <= 0.02 * len(found):
             break
-    believed = (links + loops)[np.flatnonzero(solution.weights >= DOUBTED)]
+    all_links = links + loops.links
+    believed = all_links[np.flatnonzero(solution.weights >= DOUBTED)]
     solution = solve(poses, believed)
     return PieceMap(solution.poses, firsts, believed, solution)
-
-
-def find_rows(rows: Ints, among: Ints) -> Ints:
-    """Where each of the rows (n, 2) stands among others (m, 2), which are sorted; -1: nowhere."""
-    if not len(among):
-        return np.full(len(rows), -1)
-    width = 1 + max(int(among.max()), int(rows.max(initial=0)))
-    keys, wanted = among @ [width, 1], rows @ [width, 1]
-    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[at] == wanted, at, -1)
 
 
 def solve_present(

@@ -68,6 +68,9 @@ class Links:
         return Links(self.ends + by, self.motions, self.informations, self.robust)
 
 
+NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     poses: Array  # (N, 3)

@@ -169,24 +169,25 @@ def _place_beside(
         if ends[a][end_a] is not None and ends[a][end_a] == ends[b][end_b]
     ]
     jitter_m = [max(SAME_DRIFT_M, reaches_m[a][of]) for of, _ in shared]
-    turn = _turn_by_tags(poses[a][[of for of, _ in shared]], poses[b][[of for _, of in shared]], sum(jitter_m))
+    by_tags = _turn_by_tags(poses[a][[of for of, _ in shared]], poses[b][[of for _, of in shared]], sum(jitter_m))
     places: list[tuple[bool, float, Array]] = []
     for end_a, end_b in shared:
         one = Passing(poses[a], scans[a], end_a % len(poses[a]), reaches_m[a][end_a])
         other = Passing(poses[b], scans[b], end_b % len(poses[b]), reaches_m[b][end_b])
-        if turn is None:  # the tags lie together: nothing but clear scans says how the paths lie
+        if by_tags is None:  # the tags lie together: nothing but clear scans says how the paths lie
             clear = register_passes(one, other, mount)
             found = [(1.0, clear)] if clear is not None else []
         else:
-            by_tags = turn + poses[b][end_b][2] - poses[a][end_a][2]
-            found = pass_hypotheses(one, other, mount, (0.0, np.pi, float(by_tags)))
+            turn, doubt_rad = by_tags
+            heading = float(wrap_angle(turn + poses[b][end_b][2] - poses[a][end_a][2]))
+            found = pass_hypotheses(one, other, mount, likely_headings(heading, doubt_rad))
         for worth, match in found:
             start = compose(compose(poses[a][end_a], match.motion), inverse(poses[b][end_b]))
             places.append((is_open(match), -worth, start))
     # An end where the scans see the motion along the drift too says more than one between smooth walls.
     places.sort(key=lambda of: of[:2])
-    if turn is not None:  # where no scan tells, the tags coincide
-        at = np.array([0.0, 0.0, turn])
+    if by_tags is not None:  # where no scan tells, the tags coincide
+        at = np.array([0.0, 0.0, by_tags[0]])
         places += [(True, 0.0, _shifted(at, poses[a][of], compose(at, poses[b][to]))) for of, to in shared]
     drift_m = SAME_DRIFT_SHARE * float(np.hypot(*np.diff(poses[b][:, :2], axis=0).T).sum())
     for blind, _, start in places:
@@ -198,16 +199,27 @@ def _place_beside(
     return None
 
 
-def _turn_by_tags(one: Array, other: Array, jitter_m: float) -> float | None:
-    """By how much the second path's frame is turned in the first's, from where each passes (k, 3) the same tags; None
-    where these lie no further apart than passes of one tag may.
+def _turn_by_tags(one: Array, other: Array, jitter_m: float) -> tuple[float, float] | None:
+    """By how much the second path's frame is turned in the first's, from where each passes (k, 3) the same tags, and
+    how far that may be off [rad]; None where these lie no further apart than passes of one tag may.
     """
     if len(one) < 2:
         return None
     chords = np.array([one[-1, :2] - one[0, :2], other[-1, :2] - other[0, :2]])
-    if np.hypot(*chords.T).min() < jitter_m:
+    shorter_m = float(np.hypot(*chords.T).min())
+    if shorter_m < jitter_m:
         return None
-    return float(wrap_angle(np.subtract(*np.arctan2(chords[:, 1], chords[:, 0]))))
+    turn = float(wrap_angle(np.subtract(*np.arctan2(chords[:, 1], chords[:, 0]))))
+    return turn, float(np.arcsin(jitter_m / shorter_m))
+
+
+def likely_headings(by_tags_rad: float, doubt_rad: float) -> list[float]:
+    """Which ways a vehicle may have passed a tag, as seen from a pass before: along the drift, this way or that, and
+    as the tags say, where that is another.
+    """
+    off = {along: abs(float(wrap_angle(by_tags_rad - along))) for along in (0.0, np.pi)}
+    headings = [along for along, rad in off.items() if rad < doubt_rad + SEARCH_RAD]
+    return headings if min(off.values()) < SEARCH_RAD / 2 else [*headings, by_tags_rad]
 
 
 def _shifted(start: Array, reference: Array, pose: Array) -> Array:

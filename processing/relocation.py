@@ -1,19 +1,17 @@
 """Relocation: where a key frame lies on the map so far, when open loop has strayed too far for a match from there.
 
-In: a scan, a guess and how wrong it may be; key frames with known poses. Out: the best pose. Every pose of a window
-around the guess is tried on a likelihood field (Olson 2009, correlative scan matching, in its plain form): an image of
-the known walls, blurred by as much as one step of the search, in which the points of the scan are looked up and added.
+In: a scan, a guess and how wrong it may be; key frames with known poses. Out: the best pose of a window around the
+guess, by a likelihood field (Olson 2009, correlative scan matching): an image of the known walls, blurred by as much as
+one step of the search, in which the points of the scan are looked up and added.
 """
 
-import math
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.correlative_search import search_window
 from processing.geometry import compose, inverse, relative, transform, wrap_angle
 from processing.match_search import score
-from processing.pose_graph import Links
+from processing.pose_graph import NO_LINKS, Links
 from processing.scan_walls import Scan
 from processing.strong_links import KeyFrames, blur, match_vehicles, viewpoints
 
@@ -29,7 +27,6 @@ MIN_SHARE = 0.4  # of a scan's points on walls
 MIN_SCORE, MIN_TOGETHER = 0.1, 0.8  # of one match, of all that agree
 MIN_AGREEING = 0.5  # of those that were tried
 AGREE_M, AGREE_RAD = 1.0, 0.15
-NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)
 
 
 def likelihood_field(scans: list[Scan], laser_poses: Array) -> tuple[NDArray[np.uint8], Array]:
@@ -61,8 +58,9 @@ def relocate(
     reach = float(np.hypot(*points.T).max(initial=1.0))
     turns = np.arange(-radius_rad, radius_rad + 1e-9, CELL_M / reach)
     laser = compose(guess, mount)
-    best, value = _search(field, (laser[:2] - origin) / CELL_M, laser[2] + turns, points / CELL_M, radius_m / CELL_M)
-    turned = laser + np.array([best[0] * CELL_M, best[1] * CELL_M, turns[int(best[2])]])
+    start, headings = (laser[:2] - origin) / CELL_M, laser[2] + turns
+    (dx, dy, k), value = search_window(field, start, headings, points / CELL_M, radius_m / CELL_M)
+    turned = laser + np.array([dx * CELL_M, dy * CELL_M, turns[k]])
     found = compose(turned, inverse(mount))
     return found, value / (4.0 * max(len(points), 1))
 
@@ -111,31 +109,3 @@ def relocate_stretch(
     if agree[best].sum() < max(2, MIN_AGREEING * len(tries)) or agree[best] @ np.array(worths) < MIN_TOGETHER:
         return NO_LINKS
     return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)[np.flatnonzero(agree[best])]
-
-
-@njit(cache=True)
-def _search(
-    field: NDArray[np.uint8], start: Array, headings: Array, points: Array, radius: float
-) -> tuple[tuple[float, float, float], float]:
-    """The shift [cells] and the number of the heading with the largest sum of the field under the points."""
-    height, width = field.shape
-    cells = math.ceil(radius)
-    side = 2 * cells + 1
-    best, best_sum = (0.0, 0.0, 0.0), -1.0
-    sums = np.zeros((side, side), np.int32)
-    for k in range(len(headings)):
-        c, s = math.cos(headings[k]), math.sin(headings[k])
-        sums[:] = 0
-        for i in range(len(points)):
-            column = math.floor(start[0] + c * points[i, 0] - s * points[i, 1]) - cells
-            row = math.floor(start[1] + s * points[i, 0] + c * points[i, 1]) - cells
-            low, high = max(0, -column), min(side, width - column)
-            for dy in range(max(0, -row), min(side, height - row)):
-                for dx in range(low, high):
-                    sums[dy, dx] += field[row + dy, column + dx]
-        for dy in range(side):
-            for dx in range(side):
-                if sums[dy, dx] > best_sum:
-                    best_sum = float(sums[dy, dx])
-                    best = (float(dx - cells), float(dy - cells), float(k))
-    return best, best_sum

@@ -15,6 +15,7 @@ the first guess and a large covariance (`UNSEEN_VARIANCE`).
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -216,13 +217,8 @@ def _gauss_newton(
     return valid, visible, matched, rms, converged
 
 
-def match_scans(
-    reference: Scan, current: Scan, guess: Array, reach_m: float = 1.0, max_iterations: int = 15
-) -> ScanMatch:
-    """The pose of `current` in the frame of `reference`, from the first guess (3,); scanner frames throughout.
-
-    `reach_m`: how far off the guess may be; points that find no reference point within it do not count.
-    """
+def approach(reference: Scan, current: Scan, guess: Array, reach_m: float, iterations: int) -> ScanMatch:
+    """Where a match has got to after so many steps, converged or not."""
     motion, covariance = np.empty(3), np.empty((3, 3))
     valid, visible, matched, rms, converged = _gauss_newton(
         reference.points,
@@ -235,10 +231,21 @@ def match_scans(
         current.normals,
         np.asarray(guess, dtype=np.float64),
         reach_m,
-        max_iterations,
+        iterations,
         motion,
         covariance,
     )
-    if not converged:
-        motion, covariance = np.array(guess, dtype=np.float64), np.eye(3) * UNSEEN_VARIANCE
     return ScanMatch(motion, covariance, matched / max(visible, 1), rms, converged, matched / max(valid, 1))
+
+
+def match_scans(
+    reference: Scan, current: Scan, guess: Array, reach_m: float = 1.0, max_iterations: int = 15
+) -> ScanMatch:
+    """The pose of `current` in the frame of `reference`, from the first guess (3,); scanner frames throughout.
+
+    `reach_m`: how far off the guess may be; points that find no reference point within it do not count.
+    """
+    found = approach(reference, current, guess, reach_m, max_iterations)
+    if found.converged:
+        return found
+    return replace(found, motion=np.array(guess, dtype=np.float64), covariance=np.eye(3) * UNSEEN_VARIANCE)

@@ -32,6 +32,7 @@ LOOP_RADIUS_M = 2.5  # Δr_max
 LOOP_SPACING_M = 15.0  # a drive meets its own past only after so many metres
 LOOP_INLIERS = 0.6
 MOST_LOOPS = 4  # of one key frame: where a drift was driven forty times, more would tell nothing new
+FIRST_DRIVES = 6  # which those after them are linked to rather than to each other: so each costs as much as the last
 UNSEEN_M = 1.0  # a motion known no better than this was not seen
 TILT_M, TILT_RAD = 0.02, 0.02
 MAX_SIGMA_M = 0.5  # a link that knows no better is not worth having
@@ -91,7 +92,7 @@ def _neighbours(poses: Array, i: int) -> Ints:
 
 def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: float) -> Ints:
     """Pairs (p, 2) of a new key frame and the old one with the nearest view on every stretch of drive within the
-    radius; of many drives, on the nearest MOST_LOOPS.
+    radius; of many, on MOST_LOOPS: the nearest of FIRST_DRIVES, then the nearest of all others.
     """
     if len(old) == 0 or len(new) == 0:
         return np.empty((0, 2), np.int64)
@@ -109,7 +110,8 @@ def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: 
         stretch = np.append(0, np.cumsum(breaks))
         away = np.hypot(*(views[candidates] - views[i]).T)
         best = np.lexsort((away, stretch))[np.append(0, np.flatnonzero(breaks) + 1)]  # of each stretch the nearest
-        best = np.sort(best[np.argsort(away[best], kind="stable")[:MOST_LOOPS]])
+        later = frames.drive[candidates[best]] >= FIRST_DRIVES
+        best = np.sort(best[np.lexsort((away[best], later))[:MOST_LOOPS]])
         pairs += [(k, i) for k in candidates[best].tolist()]
     return np.array(pairs, np.int64).reshape(-1, 2)
 

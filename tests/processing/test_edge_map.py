@@ -10,10 +10,8 @@ from numpy.testing import assert_allclose
 from processing.edge_map import (
     MAX_DRIFT_M,
     MAX_DRIFT_RAD,
-    RECENT_PATHS,
     Drift,
     Path,
-    find_rows,
     map_piece,
     solve_present,
 )
@@ -26,7 +24,15 @@ from processing.pose_graph import Links
 from processing.scan_match import ScanMatch
 from processing.scan_matching import match_scans
 from processing.scan_walls import Scan
-from processing.strong_links import LOOP_SPACING_M, KeyFrames, hop_pairs, loop_pairs, worth_a_link
+from processing.strong_links import (
+    FIRST_DRIVES,
+    LOOP_SPACING_M,
+    MOST_LOOPS,
+    KeyFrames,
+    hop_pairs,
+    loop_pairs,
+    worth_a_link,
+)
 
 Solved = tuple[Graph, list[SolvedPiece]]
 Truth = Callable[[SolvedPiece, list[DrivenRun]], np.ndarray]
@@ -195,6 +201,20 @@ def test_loops_join_drives_that_are_near_and_a_drive_with_its_past() -> None:
     assert len(loop_pairs(frames, poses, everything, everything[:0], 2.5)) == 0
 
 
+def test_later_drives_are_linked_to_the_first_where_those_were() -> None:
+    """Eleven drives over one place; the first four turned off before its second half."""
+    drives, count = FIRST_DRIVES + 5, 10
+    drive, x = np.repeat(np.arange(drives), count), np.tile(np.arange(count) * 1.0, drives)
+    frames = frames_along(x, drive)
+    y = np.where((drive < 4) & (x > 4), 50.0, 0.01 * drive)
+    pairs = loop_pairs(frames, np.column_stack([x, y, 0 * x]), np.arange(len(x)), np.arange(len(x)), 0.5)
+    partners = {int(i): set(drive[pairs[pairs[:, 1] == i, 0]].tolist()) for i in pairs[:, 1]}
+    last = (drives - 1) * count
+    assert partners[last + 2] == {2, 3, 4, 5}  # of the first six, the nearest
+    assert partners[last + 7] == {4, 5, 8, 9}  # the two of them that came here, and the nearest of the others
+    assert max(len(of) for of in partners.values()) == MOST_LOOPS
+
+
 def test_a_match_that_says_nothing_is_no_link() -> None:
     sure = ScanMatch(np.zeros(3), np.diag([1e-4, 1e-4, 1e-6]), 0.9, 0.01, True)
     assert worth_a_link(sure, 0.6)
@@ -205,12 +225,12 @@ def test_a_match_that_says_nothing_is_no_link() -> None:
 
 
 def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
-    """Older paths are held while a new one is fitted in, and move with all others in the end."""
+    """The first move with each other; those after them are fitted to what is there, and all move in the end."""
     path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
     count = 60  # key frames: before the run meets its own beginning
     first = replace(path, scans=path.scans[:count], keyframes=path.keyframes[:count])
     first = replace(first, chain=path.chain[np.arange(count - 1)], wheels=path.wheels[np.arange(count - 1)])
-    rng, copies = np.random.default_rng(2), RECENT_PATHS + 4
+    rng, copies = np.random.default_rng(2), FIRST_DRIVES + 4
     starts = [np.zeros(3), *rng.normal(0, [0.3, 0.1, 0.02], (copies - 1, 3))]
     bent = [turn_aside(first, 20 + k, 0.01 * (-1) ** k) for k in range(copies)]
     piece = map_piece(
@@ -230,12 +250,3 @@ def test_held_poses_stay_and_waiting_ones_wait() -> None:
     )
     free = solve_present(poses, links, here, np.zeros(4, bool))
     assert_allclose(free, [[0, 0, 0], [1, 0, 0], [9, 9, 0], [2, 0, 0]], atol=1e-9)
-
-
-def test_rows_are_found_among_sorted_ones() -> None:
-    rng = np.random.default_rng(4)
-    among = np.unique(rng.integers(0, 30, (80, 2)), axis=0)
-    rows = rng.integers(0, 30, (200, 2))
-    expected = [next((k for k, row in enumerate(among.tolist()) if row == wanted), -1) for wanted in rows.tolist()]
-    assert find_rows(rows, among).tolist() == expected
-    assert find_rows(rows[:2], np.zeros((0, 2), np.int64)).tolist() == [-1, -1]

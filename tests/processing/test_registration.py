@@ -10,7 +10,15 @@ from processing.graph import build_graph
 from processing.open_loop import mount_pose
 from processing.pieces import split_drifts
 from processing.pipeline import DrivenRun, piece_input
-from processing.registration import Passing, find_near, lies_along, pass_hypotheses, path_starts, register_passes
+from processing.registration import (
+    Passing,
+    find_near,
+    lies_along,
+    likely_headings,
+    pass_hypotheses,
+    path_starts,
+    register_passes,
+)
 from processing.scan_walls import Scan, prepare_scan
 
 STRAIGHT = np.column_stack([np.arange(0, 80, 0.75), np.zeros(107), np.zeros(107)])
@@ -148,6 +156,25 @@ def test_a_stray_path_without_a_common_tag_is_a_group_of_its_own(driven: list[Dr
     assert np.all(starts[0] == 0)
     assert np.all(starts[1] == 0)
     assert_near(starts[2], np.zeros(3), 0.01, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("by_tags_deg", "doubt_deg", "expected_deg"),
+    [
+        (3.0, 5.0, [0]),  # along the drift
+        (-175.0, 5.0, [180]),  # against it
+        (12.0, 5.0, [0, 12]),  # the one or the other
+        (90.0, 5.0, [90]),  # around a corner
+        (90.0, 60.0, [90]),
+        (60.0, 50.0, [0, 60]),  # tags close together tell little
+        (95.0, 80.0, [0, 180, 95]),
+    ],
+)
+def test_tags_far_apart_tell_which_way_a_drift_was_driven(
+    by_tags_deg: float, doubt_deg: float, expected_deg: list[float]
+) -> None:
+    headings = likely_headings(np.radians(by_tags_deg), np.radians(doubt_deg))
+    assert np.degrees(headings) == pytest.approx(expected_deg)
 
 
 def test_where_no_scan_tells_the_tags_coincide(driven: list[DrivenRun]) -> None:
