@@ -13,11 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processing.boundary import Boundary, find_boundary
-from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
+from processing.condensed import Condensed, condense
+from processing.frame_assembly import lay_out, solve_frames
 from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
 from processing.linked_paths import TAG_INFORMATION, TagJoin, join_groups, merge_groups, split_groups
-from processing.overlaps import find_overlaps, link_overlaps
+from processing.overlaps import Known, find_overlaps, link_overlaps
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links, Solution, solve
 from processing.registration import Passing, register_passes
@@ -120,8 +121,11 @@ def bend(
     ]
 
 
-def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers) -> Placement:
-    """The refined assembly: least squares of all that the pieces know of each other, then the pieces bent to fit."""
+def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers, known: Known) -> Placement:
+    """The refined assembly: least squares of all that the pieces know of each other, then the pieces bent to fit.
+
+    `known`: overlaps matched before, for the assembly that comes after this one.
+    """
     groups = split_groups(solved)
     pieces = [group.solved for group in groups]
     boundary = find_boundary(pieces)
@@ -133,7 +137,8 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, wor
     parts = [int(part[piece.variables[0]]) for piece in condensed]
     for _ in range(OVERLAP_ROUNDS):
         grown = find_boundary(pieces)
-        more = links + link_overlaps(find_overlaps(pieces, frames, parts), grown, match, work)
+        overlaps = find_overlaps(pieces, frames, parts, known)
+        more = links + link_overlaps(overlaps, grown, match, work, known)
         condensed = condense_all(pieces, grown, work)
         poses, part, _ = lay_out(condensed, more, grown.count)
         poses, weights = solve_frames(poses, condensed, more, _first_of_each(part))

@@ -4,150 +4,28 @@ In: each piece, solved by itself in its own frame. Out: the poses of its boundar
 one frame.
 
     piece A  ●━━━━━━━━━●              ● boundary: a pass belongs to the piece before it and to the piece after it, and
-                       ●━━━━━━● B     joins them rigidly; the rest of a piece is eliminated exactly (Schur complement),
-           pass shared by A and B     so what is left is small, and to solve it is to solve the whole network
+                       ●━━━━━━● B     joins them rigidly; the rest of a piece is eliminated exactly, so what is left
+           pass shared by A and B     is small, and to solve it is to solve the whole network
 
 Where pieces overlap without sharing a pass (two passes of one tag in different pieces, two edges before the same
 junction), links between their key frames join them; those key frames then belong to the boundary too.
 """
 
-from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from processing.block_cholesky import Pattern, factorise, find_pattern, solve_factors
-from processing.geometry import compose, inverse, relative, relative_jacobians, wrap_angle
-from processing.pose_graph import (
-    CORNER,
-    Links,
-    NormalEquations,
-    boundary_information,
-    normal_equations,
-    robust_weights,
-    squared_distances,
-)
+from processing.condensed import Alike, Condensed, group_alike
+from processing.geometry import compose, inverse, relative, wrap_angle
+from processing.pose_graph import CORNER, Links, normal_equations, robust_weights, squared_distances
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-
 GRADUAL = (1e4, 1e3, 1e2, CORNER)
-
-
-@dataclass(frozen=True, slots=True)
-class Condensed:
-    """What one piece knows of the relative poses of its boundary: b variables of the assembly."""
-
-    variables: Ints  # (b,)
-    local: Array  # (b, 3) in the frame of the piece
-    root: Array  # (3b - 3, 3b - 3) R: |R · error|² is the cost of the errors of poses 1 … b-1 seen from pose 0
-
-
-def condense(poses: Array, links: Links, weights: Array, boundary: Ints, variables: Ints) -> Condensed:
-    """Eliminate all poses (N, 3) of a solved piece but the boundary's."""
-    local = poses[boundary]
-    if len(boundary) < 2:
-        return Condensed(variables, local, np.zeros((0, 0)))
-    information = boundary_information(poses, links, weights, boundary)[3:, 3:]  # with the first pose held
-    _, j_b = relative_jacobians(np.broadcast_to(local[0], local[1:].shape), local[1:])
-    turn = np.linalg.inv(j_b)  # blocks on a diagonal
-    blocks = information.reshape(len(turn), 3, len(turn), 3)
-    seen = np.einsum("iba,ibjc,jcd->iajd", turn, blocks, turn, optimize=True).reshape(information.shape)
-    return Condensed(variables, local, np.linalg.cholesky((seen + seen.T) / 2).T)
-
-
-@dataclass(frozen=True, slots=True)
-class _Alike:
-    """All pieces with b variables, g of them: what is done for one is done for all at once."""
-
-    variables: Ints  # (g, b)
-    motions: Array  # (g, b - 1, 3) of poses 1 … b-1 seen from pose 0, as the pieces have them
-    roots: Array  # (g, 3b - 3, 3b - 3)
-
-    def errors(self, poses: Array) -> Array:
-        """(g, 3b - 3), whitened."""
-        there = poses[self.variables]
-        error = relative(there[:, :1], there[:, 1:]) - self.motions
-        error[..., 2] = wrap_angle(error[..., 2])
-        return np.asarray(np.einsum("gij,gj->gi", self.roots, error.reshape(len(error), -1)))
-
-    def jacobians(self, poses: Array) -> Array:
-        """(g, 3b - 3, 3b) of the same."""
-        there = poses[self.variables]
-        j_a, j_b = relative_jacobians(np.broadcast_to(there[:, :1], there[:, 1:].shape), there[:, 1:])
-        count, size = self.roots.shape[:2]
-        columns = self.roots.reshape(count, size, -1, 3)
-        first = np.einsum("gikc,gkcd->gid", columns, j_a)
-        others = np.einsum("gikc,gkcd->gikd", columns, j_b).reshape(count, size, -1)
-        return np.concatenate([first, others], axis=2)
-
-    def add_to(self, equations: NormalEquations, pattern: Pattern, poses: Array) -> None:
-        """Add what they say to the normal equations."""
-        jacobians = self.jacobians(poses)
-        normal = np.swapaxes(jacobians, 1, 2) @ jacobians
-        gradient = np.einsum("gij,gi->gj", jacobians, self.errors(poses))
-        places = pattern.place[self.variables]
-        slots = pattern.slots(self.pairs.reshape(-1, 2)).reshape(len(places), -1)
-        _scatter(normal, gradient, places, slots, equations.diagonal, equations.below, equations.gradient)
-
-    @property
-    def pairs(self) -> Ints:
-        """(g, b (b - 1) / 2, 2) variables of one piece; the later one first."""
-        later, earlier = np.tril_indices(self.variables.shape[1], -1)
-        return np.stack([self.variables[:, later], self.variables[:, earlier]], axis=2)
-
-
-@njit(cache=True)
-def _scatter(
-    normal: Array,  # (g, 3b, 3b)
-    gradient: Array,  # (g, 3b)
-    places: Ints,  # (g, b) in the order of elimination; -1: fixed
-    slots: Ints,  # (g, b (b - 1) / 2)
-    diagonal: Array,
-    below: Array,
-    right: Array,
-) -> None:
-    for g in range(len(places)):
-        pair = -1
-        for k in range(places.shape[1]):
-            p = places[g, k]
-            for i in range(3 if p >= 0 else 0):
-                right[p, i] += gradient[g, 3 * k + i]
-                for j in range(3):
-                    diagonal[p, i, j] += normal[g, 3 * k + i, 3 * k + j]
-            for m in range(k):
-                pair += 1
-                q = places[g, m]
-                if p < 0 or q < 0:
-                    continue
-                high, low = (k, m) if p > q else (m, k)
-                for i in range(3):
-                    for j in range(3):
-                        value = normal[g, 3 * high + i, 3 * low + j]
-                        if p != q:
-                            below[slots[g, pair], i, j] += value
-                        else:  # a run that turned: one pass ends two of the piece's paths
-                            diagonal[p, i, j] += value
-                            diagonal[p, j, i] += value
-
-
-def _group(pieces: list[Condensed]) -> list[_Alike]:
-    """Pieces by the number of their variables; what has only one says nothing."""
-    sizes: dict[int, list[Condensed]] = {}
-    for piece in pieces:
-        sizes.setdefault(len(piece.variables), []).append(piece)
-    groups = []
-    for size, members in sorted(sizes.items()):
-        if size > 1:
-            local = np.array([piece.local for piece in members])
-            variables = np.array([piece.variables for piece in members], np.int64)
-            roots = np.array([piece.root for piece in members])
-            groups.append(_Alike(variables, relative(local[:, :1], local[:, 1:]), roots))
-    return groups
 
 
 def solve_frames(
@@ -158,7 +36,7 @@ def solve_frames(
     With falling corners (graduated non-convexity): a loop that comes back a metre off is closed by its links, which
     agree, before any of them is doubted. `fixed` (V,): one variable of each connected part, at least.
     """
-    poses, groups = first_guess, _group(pieces)
+    poses, groups = first_guess, group_alike(pieces)
     ends = np.concatenate([links.ends, *(group.pairs.reshape(-1, 2) for group in groups)])
     pattern = find_pattern(len(poses), ends, fixed)
     for corner in GRADUAL if np.any(links.robust) else (CORNER,):
@@ -167,7 +45,7 @@ def solve_frames(
 
 
 def _minimise(
-    first_guess: Array, groups: list[_Alike], links: Links, pattern: Pattern, corner: float, max_iterations: int
+    first_guess: Array, groups: list[Alike], links: Links, pattern: Pattern, corner: float, max_iterations: int
 ) -> Array:
     poses, cost, damping = first_guess.copy(), _cost(first_guess, groups, links, corner), 0.0
     for _ in range(max_iterations if len(pattern) else 0):
@@ -186,7 +64,7 @@ def _minimise(
 
 
 def _step(
-    poses: Array, groups: list[_Alike], links: Links, pattern: Pattern, corner: float, damping: float
+    poses: Array, groups: list[Alike], links: Links, pattern: Pattern, corner: float, damping: float
 ) -> Array | None:
     """The poses after one step; None where the equations have no solution."""
     weights = robust_weights(squared_distances(poses, links), links.robust, corner)
@@ -202,10 +80,10 @@ def _step(
     return moved
 
 
-def _cost(poses: Array, groups: list[_Alike], links: Links, corner: float) -> float:
+def _cost(poses: Array, groups: list[Alike], links: Links, corner: float) -> float:
     squares = squared_distances(poses, links)
     robust = np.where(links.robust, corner * squares / (corner + squares), squares).sum()
-    return float(robust + sum(np.square(group.errors(poses)).sum() for group in groups))
+    return float(robust + sum(group.cost(poses) for group in groups))
 
 
 def lay_out(pieces: list[Condensed], links: Links, variables: int) -> tuple[Array, Ints, list[Array]]:

@@ -1,6 +1,7 @@
 """Overlaps: pieces that lie over each other without sharing a pass, joined by links between their key frames.
 
-In: solved pieces, and where the assembly has put their frames so far. Out: links, whose ends join the boundary.
+In: solved pieces, and where the assembly has put their frames so far. Out: links, whose ends join the boundary. What
+was matched once is not matched again, as long as the assembly confirms it.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from processing.boundary import Boundary
-from processing.geometry import compose, relative
+from processing.geometry import compose, relative, wrap_angle
+from processing.known_matches import CONFIRMED
 from processing.pieces import SolvedPiece
 from processing.pose_graph import Links
 from processing.registration import find_near, is_open
@@ -25,7 +27,12 @@ Array = NDArray[np.float64]
 
 OVERLAP_M = 2.5  # key frames of different pieces this close see the same walls
 OVERLAP_SPACING_M = 3.0
+ALONG_M = 0.3  # along an open direction, from guesses as close a match says the same of the others
 SEARCHES = 4  # key frames of an overlap whose match may be metres off
+
+
+Pair = tuple[str, int, str, int]  # two key frames: of which run, which of it
+Known = dict[Pair, tuple[Array, ScanMatch]]  # the guess (3,) that a match began with, and what came of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,23 +42,26 @@ class Overlap:
     numbers: tuple[int, int]  # of the pieces
     mount: Array  # (3,) scanner in the vehicle
     indices: list[tuple[int, int]]  # k
+    pairs: list[Pair]  # k, the same
     scans: list[tuple[StoredScans, StoredScans]]  # k, one scan each
     guesses: list[Array]  # k of (3,): the second seen from the first
+    known: list[ScanMatch | None]  # k, those that need not be made again
 
     def match(self, match: Matcher) -> list[ScanMatch]:
         """k matches, of the vehicle; where none says in all directions how the pieces lie, some are searched for."""
         found = [
-            match_vehicles(one[0], other[0], guess, self.mount, match)
-            for (one, other), guess in zip(self.scans, self.guesses, strict=True)
+            known or match_vehicles(one[0], other[0], guess, self.mount, match)
+            for (one, other), guess, known in zip(self.scans, self.guesses, self.known, strict=True)
         ]
         if not any(worth_a_link(of, LOOP_INLIERS) and not is_open(of) for of in found):
             for n in np.unique(np.linspace(0, len(found) - 1, SEARCHES).round().astype(int)).tolist():
-                one, other = self.scans[n]
-                found[n] = find_near(one[0], other[0], self.guesses[n], self.mount) or found[n]
+                if self.known[n] is None:
+                    one, other = self.scans[n]
+                    found[n] = find_near(one[0], other[0], self.guesses[n], self.mount) or found[n]
         return found
 
 
-def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int]) -> list[Overlap]:
+def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int], known: Known) -> list[Overlap]:
     poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
     views = [viewpoints(of, piece.input.mount) for of, piece in zip(poses, solved, strict=True)]
     trees = [cKDTree(of) for of in views]
@@ -63,25 +73,44 @@ def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[in
             if parts[p] != parts[q]:
                 continue
             distance, near = trees[p].query(views[q], distance_upper_bound=OVERLAP_M)
-            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [])
+            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [], [], [])
             for k in np.flatnonzero(np.isfinite(distance)):
                 if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
                     continue
                 i, last = int(near[k]), poses[q][k, :2]
+                pair, guess = (*solved[p].keyframe(i), *solved[q].keyframe(int(k))), relative(poses[p][i], poses[q][k])
                 overlap.indices.append((i, int(k)))
+                overlap.pairs.append(pair)
                 overlap.scans.append((solved[p].scan(i), solved[q].scan(int(k))))
-                overlap.guesses.append(relative(poses[p][i], poses[q][k]))
+                overlap.guesses.append(guess)
+                overlap.known.append(known[pair][1] if pair in known and confirms(guess, *known[pair]) else None)
             found += [overlap] * bool(overlap.indices)
     return found
 
 
-def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers) -> Links:
-    """Links between the key frames of overlaps, which join the boundary."""
+def confirms(guess: Array, before: Array, found: ScanMatch) -> bool:
+    """Would a match from this guess (3,) find the same as from the guess before? Where walls leave a direction open,
+    also from elsewhere along it.
+    """
+    moved, off = guess - before, guess - found.motion
+    moved[2], off[2] = wrap_angle(moved[2]), wrap_angle(off[2])
+    if not found.converged:
+        return bool(np.all(np.abs(moved) < CONFIRMED))
+    doubt = found.covariance + np.diag(np.square(CONFIRMED))
+    return bool(off @ np.linalg.solve(doubt, off) < 1.0 and np.hypot(*moved[:2]) < ALONG_M)
+
+
+def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, work: Workers, known: Known) -> Links:
+    """Links between the key frames of overlaps, which join the boundary; `known` learns what was matched."""
     ends, motions, informations = [], [], []
     matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps, at_once=10)
     for overlap, found in zip(overlaps, matches, strict=True):
         p, q = overlap.numbers
-        for (i, k), seen in zip(overlap.indices, found, strict=True):
+        for (i, k), pair, guess, before, seen in zip(
+            overlap.indices, overlap.pairs, overlap.guesses, overlap.known, found, strict=True
+        ):
+            if before is None:
+                known[pair] = guess, seen
             if worth_a_link(seen, LOOP_INLIERS):
                 a, b = boundary.add(p, i), boundary.add(q, k)
                 if a == b:  # the pass that both begin with: nothing between

@@ -54,6 +54,12 @@ class SolvedPiece:
         p = self.path_of(index)
         return self.input.paths[p].scans.alone(index - int(self.map.firsts[p]))
 
+    def keyframe(self, index: int) -> tuple[str, int]:
+        """Of which run it is, and which of its key frames."""
+        p = self.path_of(index)
+        path = self.input.paths[p]
+        return path.run_id, int(path.keyframes[index - int(self.map.firsts[p])])
+
     def path_of(self, index: int) -> int:
         return int(np.searchsorted(self.map.firsts, index, side="right")) - 1
 

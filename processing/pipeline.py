@@ -89,7 +89,7 @@ def map_network(
     runs: list[DrivenRun], work: Workers, match: Matcher, config: Config
 ) -> tuple[list[DrivenRun], Graph, Placement]:
     """Solve the pieces and assemble them; again, as far as they changed, where the map shows passes without a read."""
-    place = place_by_frames if config.assembly == "refined" else place_by_lengths
+    place = partial(place_by_frames, known={}) if config.assembly == "refined" else place_by_lengths
     known: dict[Piece, list[SolvedPiece]] = {}
     for review in range(MAX_REVIEWS + 1):
         graph = build_graph([run.passes for run in runs], [len(run.loop) for run in runs])

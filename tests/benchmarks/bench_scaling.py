@@ -16,7 +16,8 @@ from network_world import length_m
 from table import Figure, report
 
 from processing.assembly import assemble_paper
-from processing.frame_assembly import Condensed, lay_out, solve_frames
+from processing.condensed import Condensed
+from processing.frame_assembly import lay_out, solve_frames
 from processing.geometry import compose, relative, wrap_angle
 from processing.pose_graph import Links
 

@@ -37,10 +37,14 @@ def renamed(of: DrivenRun) -> DrivenRun:
     return replace(of, passes=[replace(found, epc=found.epc.replace("E2003412", "E2009999")) for found in of.passes])
 
 
+def place_anew(pieces: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers) -> Placement:
+    return place_by_frames(pieces, graph, match, work, known={})
+
+
 @pytest.fixture(scope="module")
 def placement(solved: Solved) -> Placement:
     graph, pieces = solved
-    return place_by_frames(pieces, graph, match_scans, Workers(1))
+    return place_anew(pieces, graph, match_scans, Workers(1))
 
 
 def test_walls_are_stitched_within_two_cells_of_the_true_ones(
@@ -48,7 +52,7 @@ def test_walls_are_stitched_within_two_cells_of_the_true_ones(
 ) -> None:
     """Without noise, all pieces drawn where they were placed: no cell of a wall further off than that."""
     graph, solved = solve_runs(driven_clean)
-    placement = place_by_frames(solved, graph, match_scans, Workers(1))
+    placement = place_anew(solved, graph, match_scans, Workers(1))
     into_world, off = move_into_world(placement.pieces, driven_clean)
     assert off.max() < 0.03
     walls = np.loadtxt(small_world / "walls.csv", delimiter=",", skiprows=1)
@@ -123,7 +127,7 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     """The same mine, but the second run read other tags: nothing may be joined, and the user is told."""
     runs = [driven[0], renamed(driven[1])]
     graph, pieces = solve_runs(runs)
-    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
+    placement = place_anew(pieces, graph, match_scans, Workers(1))
     assert len(placement.remarks) == 1
     assert "2 unconnected parts" in placement.remarks[0]
     assert "run small-back shares no tag with the others: it is mapped alone" in remarks(runs, placement)
@@ -142,7 +146,7 @@ def test_runs_without_a_common_tag_are_parts_side_by_side(
     assert sorted(placement.node_parts.tolist()) == [0] * 4 + [1] * (len(graph.nodes) - 4)
 
 
-@pytest.mark.parametrize(("place", "most_m"), [(place_by_frames, 0.1), (place_by_lengths, 0.8)])
+@pytest.mark.parametrize(("place", "most_m"), [(place_anew, 0.1), (place_by_lengths, 0.8)])
 @pytest.mark.parametrize(("other", "tag"), [(0, 0), (1, 1)])
 def test_a_run_that_shares_one_tag_hangs_on_the_map_there(
     driven: list[DrivenRun], solve_runs: Solve, move_into_world: Move, other: int, tag: int, place: Place, most_m: float
@@ -162,7 +166,7 @@ def test_a_run_without_tags_is_mapped_alone_and_told(
 ) -> None:
     runs = [driven[0], replace(driven[1], passes=[])]
     graph, pieces = solve_runs(runs)
-    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
+    placement = place_anew(pieces, graph, match_scans, Workers(1))
     (alone,) = [piece for piece in placement.pieces if piece.solved.input.piece.i is None]
     assert [piece.part for piece in placement.pieces if piece is not alone] == [1 - alone.part] * (len(pieces) - 1)
     assert move_into_world([alone], driven)[1].max() < 0.1
@@ -173,7 +177,7 @@ def test_a_run_without_tags_is_mapped_alone_and_told(
 
 def test_no_run_with_a_tag_still_makes_a_map(driven: list[DrivenRun], solve_runs: Solve) -> None:
     graph, pieces = solve_runs([replace(driven[1], passes=[])])
-    placement = place_by_frames(pieces, graph, match_scans, Workers(1))
+    placement = place_anew(pieces, graph, match_scans, Workers(1))
     assert graph.nodes == ()
     assert placement.nodes.shape == (0, 3)
     (alone,) = placement.pieces
@@ -195,7 +199,7 @@ def test_a_stretched_piece_gives_way_to_its_neighbours(
     ends = weak.ends
     stretched = replace(weak, motions=relative(poses[ends[:, 0]], poses[ends[:, 1]]))
     bent = replace(piece, map=replace(piece.map, poses=poses, links=stretched))
-    placement = place_by_frames([*pieces[:chosen], bent, *pieces[chosen + 1 :]], graph, match_scans, Workers(1))
+    placement = place_anew([*pieces[:chosen], bent, *pieces[chosen + 1 :]], graph, match_scans, Workers(1))
     stretch = np.hypot(*(poses - piece.map.poses)[:, :2].T).max()
     assert stretch > 0.5
     others = [placed for placed in placement.pieces if placed.solved.input is not piece.input]

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from processing.frame_assembly import Condensed, condense, lay_out, solve_frames
+from processing.condensed import Condensed, condense
+from processing.frame_assembly import lay_out, solve_frames
 from processing.geometry import accumulate, compose, relative, wrap_angle
 from processing.pose_graph import Links, solve
 

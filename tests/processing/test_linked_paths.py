@@ -80,6 +80,6 @@ def test_a_wrong_turn_between_unjoined_paths_bends_nothing(
     move_into_world: Callable[[list[Placed], list[DrivenRun]], tuple[np.ndarray, np.ndarray]],
 ) -> None:
     """Taken for one rigid piece, to first order, its paths would come out sheared by metres."""
-    placement = place_by_frames(with_one_torn[0], solved[0], match_scans, Workers(1))
+    placement = place_by_frames(with_one_torn[0], solved[0], match_scans, Workers(1), known={})
     assert {piece.part for piece in placement.pieces} == {0}
     assert move_into_world(placement.pieces, driven)[1].max() < 0.1
