@@ -1,8 +1,8 @@
 """Sparse Cholesky factors of normal equations whose unknowns are poses: blocks of 3 × 3 numbers.
 
 In: which poses are linked. Out: the pattern of the factor, found once; then factors, solutions and blocks of the
-inverse for as many matrices of that pattern as are wanted. Poses are eliminated by minimum degree; the entries of the
-matrix lie where those of the factor will, which is computed in place, column after column.
+inverse for as many matrices of that pattern as are wanted. Poses are eliminated by minimum degree, those of a chain in
+its order; the entries of the matrix lie where those of the factor will, which is computed in place, column after column.
 
     order   2 0 1        diagonal (n, 3, 3)      below (e, 3, 3): the blocks of a column one after the other,
             ▪                                     of rows `rows[first[j]:first[j + 1]]`, ascending
@@ -24,6 +24,8 @@ from scipy.sparse.linalg import splu
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+CHAIN = 16  # where no link reaches further along a row of poses, they are best eliminated one after the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,8 @@ def find_pattern(poses: int, ends: Ints, fixed: NDArray[np.bool_]) -> Pattern:
     both = both[np.all(both >= 0, axis=1) & (both[:, 0] != both[:, 1])]
     a, b = np.concatenate([both, both[:, ::-1]]).T
     adjacent = sp.csr_array((np.ones(len(a)), (a, b)), shape=(len(free), len(free)))
-    place = _minimum_degree(adjacent)
+    is_chain = np.abs(a - b).max(initial=0) <= CHAIN
+    place = np.arange(len(free)) if is_chain else _minimum_degree(adjacent)
     order = np.argsort(place)
     first, rows = _fill(adjacent.indptr.astype(np.int64), adjacent.indices.astype(np.int64), place, order)
     of_row = np.argsort(rows, kind="stable")

@@ -139,7 +139,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
     strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
         drift = Drift.of(paths[path].start_doubt_m, LOST_RAD if paths[path].start_doubt_m else 0.0)
-        held = (frames.drive < path) & (path >= FIRST_DRIVES)  # the first move with each other, until enough are there
+        held = frames.drive < path
         for stretch in _stretches(frames, chain, np.arange(firsts[path], firsts[path + 1])):
             if stretch[0] > firsts[path]:  # carry on from what the graph has made of the stretch before
                 onward = chain[(chain.ends[:, 1] >= stretch[0]) & (chain.ends[:, 1] <= stretch[-1])]
@@ -159,6 +159,8 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
                 drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
             strayed[stretch] = drift.radius_m, drift.radius_rad
+        if path < FIRST_DRIVES:  # these move with each other; of more, the last hardly tell the first anything new
+            poses = solve_present(poses, links + loops, present, np.zeros(len(poses), bool))
     return _settle(frames, links, poses, firsts, known)
 
 
