@@ -2,7 +2,7 @@
 
 In: which poses are linked. Out: the pattern of the factor, found once; then factors, solutions and blocks of the
 inverse for as many matrices of that pattern as are wanted. Poses are eliminated by minimum degree, those of a chain in
-its order; the entries of the matrix lie where those of the factor will, which is computed in place, column after column.
+its order; the entries of the matrix lie where those of the factor will, which is computed in place, column by column.
 
     order   2 0 1        diagonal (n, 3, 3)      below (e, 3, 3): the blocks of a column one after the other,
             ▪                                     of rows `rows[first[j]:first[j + 1]]`, ascending

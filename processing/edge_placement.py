@@ -55,17 +55,12 @@ class Placement:
     remarks: list[str]
 
 
-def condense_all(solved: list[SolvedPiece], boundary: Boundary, work: Workers) -> list[Condensed]:
-    maps = [piece.map for piece in solved]
-    return work.starmap(
-        "assembly",
-        condense,
-        [
-            (of.poses, of.links, of.solution.weights, np.array(indices, np.int64), np.array(variables, np.int64))
-            for of, indices, variables in zip(maps, boundary.indices, boundary.variables, strict=True)
-        ],
-        at_once=10,
-    )
+def condense_all(solved: list[SolvedPiece], boundary: Boundary) -> list[Condensed]:
+    """Here alone: to send the links to other processes takes longer."""
+    return [
+        condense(of.map.poses, of.map.links, of.map.solution.weights, np.array(indices), np.array(variables))
+        for of, indices, variables in zip(solved, boundary.indices, boundary.variables, strict=True)
+    ]
 
 
 def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
@@ -129,7 +124,7 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, wor
     groups = split_groups(solved)
     pieces = [group.solved for group in groups]
     boundary = find_boundary(pieces)
-    condensed = condense_all(pieces, boundary, work)
+    condensed = condense_all(pieces, boundary)
     links = link_nodes(pieces, boundary) + link_tags(join_groups(groups), boundary)
     poses, part, frames = lay_out(condensed, links, boundary.count)
     poses, _ = solve_frames(poses, condensed, links, _first_of_each(part))
@@ -139,7 +134,7 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, wor
         grown = find_boundary(pieces)
         overlaps = find_overlaps(pieces, frames, parts, known)
         more = links + link_overlaps(overlaps, grown, match, work, known)
-        condensed = condense_all(pieces, grown, work)
+        condensed = condense_all(pieces, grown)
         poses, part, _ = lay_out(condensed, more, grown.count)
         poses, weights = solve_frames(poses, condensed, more, _first_of_each(part))
         frames, boundary = [fit_frame(piece, poses) for piece in condensed], grown
