@@ -132,7 +132,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         chain
         + _wheels(paths, firsts)
         + _joins(paths, firsts)
-        + match_pairs(frames, poses, hop_pairs(frames), HOP_INLIERS, between_drives=False)
+        + _hops(frames, poses, hop_pairs(frames, range(min(len(paths), FIRST_DRIVES))))
     )
     loops, known = NO_LINKS, Matches.none()
     present = np.zeros(len(poses), bool)
@@ -161,7 +161,15 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
             strayed[stretch] = drift.radius_m, drift.radius_rad
         if path < FIRST_DRIVES:  # these move with each other; of more, the last hardly tell the first anything new
             poses = solve_present(poses, links + loops, present, np.zeros(len(poses), bool))
+        else:  # and only where they are alone must they be stiff themselves
+            pairs, linked = hop_pairs(frames, [path]), np.zeros(len(poses), bool)
+            linked[loops.ends] = True
+            links = links + _hops(frames, poses, pairs[~np.all(linked[pairs], axis=1)])
     return _settle(frames, links, poses, firsts, known)
+
+
+def _hops(frames: KeyFrames, poses: Array, pairs: Ints) -> Links:
+    return match_pairs(frames, poses, pairs, HOP_INLIERS, between_drives=False)
 
 
 def _close(

@@ -10,6 +10,7 @@ In: key frames with their scans and the poses so far. Out: links. Two kinds of p
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,17 +52,17 @@ class KeyFrames:
     match: Matcher
 
 
-def hop_pairs(frames: KeyFrames) -> Ints:
-    """Pairs (p, 2) along each drive, one for each of HOPS_M and key frame."""
-    pairs = []
-    for drive in np.unique(frames.drive):
+def hop_pairs(frames: KeyFrames, drives: Iterable[int]) -> Ints:
+    """Pairs (p, 2) along each of these drives, one for each of HOPS_M and key frame."""
+    pairs = [np.empty((0, 2), np.int64)]
+    for drive in drives:
         members = np.flatnonzero(frames.drive == drive)
         way = frames.travelled[members]
         for hop in HOPS_M:
             ends = np.searchsorted(way, way + hop)
             valid = (ends < len(members)) & (ends > np.arange(len(members)) + 1)
             pairs.append(np.column_stack([members[valid], members[np.minimum(ends, len(members) - 1)[valid]]]))
-    return np.unique(np.concatenate(pairs), axis=0) if pairs else np.empty((0, 2), np.int64)
+    return np.unique(np.concatenate(pairs), axis=0)
 
 
 def viewpoints(poses: Array, mount: Array) -> Array:

@@ -178,12 +178,13 @@ def test_a_drive_strays_further_the_longer_it_goes(driven: list[DrivenRun]) -> N
 def test_hops_join_what_lies_metres_apart_on_one_drive() -> None:
     way = np.concatenate([np.arange(0, 12, 0.75), np.arange(0, 12, 0.75)])
     drive = np.repeat([0, 1], 16)
-    pairs = hop_pairs(frames_along(way, drive))
+    pairs = hop_pairs(frames_along(way, drive), [0, 1])
     assert np.all(drive[pairs[:, 0]] == drive[pairs[:, 1]])
     hops = way[pairs[:, 1]] - way[pairs[:, 0]]
     assert np.all(np.min(np.abs(hops[:, None] - [2.0, 4.0, 8.0]), axis=1) < 0.76)
     assert len(np.unique(pairs, axis=0)) == len(pairs)
-    assert len(hop_pairs(frames_along(np.arange(2.0), np.zeros(2, np.int64)))) == 0
+    assert len(hop_pairs(frames_along(np.arange(2.0), np.zeros(2, np.int64)), [0])) == 0
+    assert set(drive[hop_pairs(frames_along(way, drive), [1])].ravel().tolist()) == {1}
 
 
 def test_loops_join_drives_that_are_near_and_a_drive_with_its_past() -> None:
