@@ -27,6 +27,7 @@ SEARCH_M, SEARCH_RAD = 2.0, 0.3  # how far apart two passes of a tag may be
 FAR_M, FARTHEST_M = 4.0, 8.0  # a tag that is read from further off has clouds that are cut off; no search goes further
 MIN_INLIERS = 0.75
 MIN_WORTH = 0.1  # by agreement: one pair of different places in twenty has as much, nineteen of twenty passes more
+SURE_WORTH = 0.5  # one end of a path that is found as well says enough
 SEEN_M = 0.5  # standard deviation of a motion that the walls tell in every direction
 CLEARLY_BETTER = 0.15  # of two headings, by their scores: a smooth drift looks the same both ways
 SAME_DRIFT_M, SAME_DRIFT_SHARE = 3.0, 0.03  # how far a path may lie beside another in the same drift, plus drift
@@ -170,6 +171,14 @@ def _place_beside(
     ]
     jitter_m = [max(SAME_DRIFT_M, reaches_m[a][of]) for of, _ in shared]
     by_tags = _turn_by_tags(poses[a][[of for of, _ in shared]], poses[b][[of for _, of in shared]], sum(jitter_m))
+    drift_m = SAME_DRIFT_SHARE * float(np.hypot(*np.diff(poses[b][:, :2], axis=0).T).sum())
+
+    def fits(start: Array) -> bool:
+        there = compose(start, poses[b])
+        apart_m = [float(np.hypot(*(there[to] - poses[a][of])[:2])) for of, to in shared]
+        meet = all(apart < most + drift_m for apart, most in zip(apart_m, jitter_m, strict=True))
+        return meet and lies_along(poses[a], there)
+
     places: list[tuple[bool, float, Array]] = []
     for end_a, end_b in shared:
         one = Passing(poses[a], scans[a], end_a % len(poses[a]), reaches_m[a][end_a])
@@ -183,18 +192,16 @@ def _place_beside(
             found = pass_hypotheses(one, other, mount, likely_headings(heading, doubt_rad))
         for worth, match in found:
             start = compose(compose(poses[a][end_a], match.motion), inverse(poses[b][end_b]))
+            if worth > SURE_WORTH and not is_open(match) and fits(start):
+                return start, 0.0
             places.append((is_open(match), -worth, start))
     # An end where the scans see the motion along the drift too says more than one between smooth walls.
     places.sort(key=lambda of: of[:2])
     if by_tags is not None:  # where no scan tells, the tags coincide
         at = np.array([0.0, 0.0, by_tags[0]])
         places += [(True, 0.0, _shifted(at, poses[a][of], compose(at, poses[b][to]))) for of, to in shared]
-    drift_m = SAME_DRIFT_SHARE * float(np.hypot(*np.diff(poses[b][:, :2], axis=0).T).sum())
     for blind, _, start in places:
-        there = compose(start, poses[b])
-        apart_m = [float(np.hypot(*(there[to] - poses[a][of])[:2])) for of, to in shared]
-        meet = all(apart < most + drift_m for apart, most in zip(apart_m, jitter_m, strict=True))
-        if meet and lies_along(poses[a], there):
+        if fits(start):
             return start, max(jitter_m) if blind else 0.0
     return None
 
