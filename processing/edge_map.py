@@ -36,6 +36,7 @@ STRETCH_M = 5.0
 FEW, LEAST_SHARE = 3, 0.3  # so many pairs or more, of which less than this share match, are no closed loop
 LOST_M, LOST_RAD = 5.0, 0.6  # how far to look for a stretch that is not where it should be
 GRADUAL = (1e7, 1e6, 1e5, 1e4, 1e3, 1e2, CORNER)
+STIFF_DRIVES = 2  # later ones must be stiff themselves only where they are alone
 MAX_ROUNDS = 5
 MAX_DRIFT_M, MAX_DRIFT_RAD = 7.0, 0.6  # beyond, a search finds more wrong places than right ones
 WEAK_M, WEAK_RAD = 0.2, 0.05  # a link of the chain with more doubt than this
@@ -132,7 +133,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         chain
         + _wheels(paths, firsts)
         + _joins(paths, firsts)
-        + _hops(frames, poses, hop_pairs(frames, range(min(len(paths), FIRST_DRIVES))))
+        + _hops(frames, poses, hop_pairs(frames, range(min(len(paths), STIFF_DRIVES))))
     )
     loops, known = NO_LINKS, Matches.none()
     present = np.zeros(len(poses), bool)
@@ -159,12 +160,12 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 anchor = found.ends[:, 0][np.argmin(strayed[found.ends[:, 0], 0])]
                 drift = drift.at_most(*strayed[anchor])  # no surer than what it is linked to
             strayed[stretch] = drift.radius_m, drift.radius_rad
-        if path < FIRST_DRIVES:  # these move with each other; of more, the last hardly tell the first anything new
-            poses = solve_present(poses, links + loops, present, np.zeros(len(poses), bool))
-        else:  # and only where they are alone must they be stiff themselves
+        if path >= STIFF_DRIVES:
             pairs, linked = hop_pairs(frames, [path]), np.zeros(len(poses), bool)
             linked[loops.ends] = True
             links = links + _hops(frames, poses, pairs[~np.all(linked[pairs], axis=1)])
+        if path < FIRST_DRIVES:  # these move with each other; of more, the last hardly tell the first anything new
+            poses = solve_present(poses, links + loops, present, np.zeros(len(poses), bool))
     return _settle(frames, links, poses, firsts, known)
 
 
