@@ -148,12 +148,12 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
                 drift = drift.after(onward)
             old = np.flatnonzero(present)
             present[stretch] = True
-            placed, closed, poses = _close(frames, poses, links + loops, stretch, old, present, held, strayed, drift)
-            if closed is None:
+            placed, closed, poses, lost = _close(
+                frames, poses, links + loops, stretch, old, present, held, strayed, drift
+            )
+            if lost:
                 drift = Drift.of(LOST_M, LOST_RAD)
-            else:
-                known = known.joined(closed)
-            found = placed if closed is None else placed + closed.links
+            known, found = known.joined(closed), placed + closed.links
             loops = loops + found
             if len(found):
                 poses = solve_present(poses, links + loops, present, held)
@@ -183,9 +183,8 @@ def _close(
     held: NDArray[np.bool_],
     strayed: Array,
     drift: Drift,
-) -> tuple[Links, Matches | None, Array]:
-    """Where a new stretch was found, the loops that it closes, and the poses with the stretch there; no matches: it is
-    lost.
+) -> tuple[Links, Matches, Array, bool]:
+    """Where a new stretch was found, the loops that it closes, the poses with it there, and whether it is lost.
 
     Where most pairs that should match do not, the stretch lies elsewhere, and the few that do are chance.
     """
@@ -199,12 +198,11 @@ def _close(
                 break
             if len(placed):
                 tried = solve_present(poses, links + placed, present, held, GRADUAL)
-        closed = match_loops(
-            frames, tried, loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M), known=Matches.none()
-        )
+        pairs = loop_pairs(frames, tried, stretch, old, LOOP_RADIUS_M)
+        closed = match_loops(frames, tried, pairs, known=Matches.none())
         if len(closed.pairs) < FEW or len(closed.links) >= LEAST_SHARE * len(closed.pairs):
-            return placed, closed, tried
-    return NO_LINKS, None, poses
+            return placed, closed, tried, False
+    return NO_LINKS, Matches.none(), poses, True
 
 
 def _settle(frames: KeyFrames, links: Links, poses: Array, firsts: Ints, loops: Matches) -> PieceMap:

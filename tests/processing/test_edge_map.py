@@ -48,6 +48,14 @@ def whole_run(of: DrivenRun) -> Path:
     return Path(of.run.run_id, np.arange(len(loop.keyframes)), loop.scans, loop.links, loop.wheels, np.zeros(3))
 
 
+def beginning(of: Path, count: int) -> Path:
+    """Its first key frames."""
+    rows = np.arange(count - 1)
+    return replace(
+        of, scans=of.scans[:count], keyframes=of.keyframes[:count], chain=of.chain[rows], wheels=of.wheels[rows]
+    )
+
+
 def turn_aside(path: Path, at: int, radians: float) -> Path:
     """The path with one link of its chain turned, as by a wrong match in a bend; the wheels are right about it."""
     motions = path.chain.motions.copy()
@@ -229,8 +237,7 @@ def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRu
     """The first move with each other; those after them are fitted to what is there, and all move in the end."""
     path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
     count = 60  # key frames: before the run meets its own beginning
-    first = replace(path, scans=path.scans[:count], keyframes=path.keyframes[:count])
-    first = replace(first, chain=path.chain[np.arange(count - 1)], wheels=path.wheels[np.arange(count - 1)])
+    first = beginning(path, count)
     rng, copies = np.random.default_rng(2), FIRST_DRIVES + 4
     starts = [np.zeros(3), *rng.normal(0, [0.3, 0.1, 0.02], (copies - 1, 3))]
     bent = [turn_aside(first, 20 + k, 0.01 * (-1) ** k) for k in range(copies)]
@@ -238,6 +245,19 @@ def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRu
         [replace(of, start=at) for of, at in zip(bent, starts, strict=True)], mount_pose(driven[0].run), match_scans
     )
     assert off(piece.poses, np.tile(true[:count], (copies, 1))).max() < 0.1
+
+
+def test_later_drives_are_stiff_where_they_are_alone(driven: list[DrivenRun]) -> None:
+    """The third drive over the same ground goes on where the first two ended."""
+    path = whole_run(driven[0])
+    drives = [beginning(path, count) for count in (40, 40, 60)]
+    piece = map_piece(drives, mount_pose(driven[0].run), match_scans)
+    ends = piece.links.ends[piece.strong]
+    for first, last in ((0, 40), (40, 80)):
+        assert np.sum(np.all((ends >= first) & (ends < last), axis=1)) > 60
+    third = ends[np.all(ends >= 80, axis=1)] - 80
+    assert np.sum(third.max(axis=1) < 36) == 0
+    assert np.sum(third.max(axis=1) > 44) > 20
 
 
 def test_held_poses_stay_and_waiting_ones_wait() -> None:
