@@ -73,25 +73,25 @@ CHOSEN = """## What was chosen, and why
 
 Written by hand from the tables above.
 
-- **Matcher: point-to-line.** In rough rock `psm` makes as good a map; on two_drifts and in the straight drift it is
-  nearly or more than twice as far off, and a build takes up to five times as long. On the real log its chain alone is
-  three times as far off, which only the closed loops make good.
+- **Matcher: point-to-line.** In rough rock `psm` makes as good a map, or one a third further off; in the straight drift
+  it is one and a half times as far off, on two_drifts nearly three times, and a build takes two to three times as long.
+  On the real log its chain alone is three times as far off, which only the closed loops make good.
 - **Reference: a key frame every 0.75 m.** The chain alone drifts the more the nearer the reference is, for each match
   adds its error: most from scan to scan, which is the paper's way, least with key frames 1.5 m to 3 m apart. The
   closed map wants the opposite: links over 2, 4 and 8 m stiffen the chain anyway, and more key frames make more links
-  between drives. 0.25 m, or every scan, gains less than a millimetre on the loop and nothing on the real log, and
-  loses more than a centimetre in the straight drift, for up to four times the CPU and with covariances that are too
-  sure (NEES of 5 to 6 in the mean). 1.5 m loses four millimetres on the loop and two centimetres in the straight
-  drift; 3 m three millimetres on the loop and more than four on the real log.
-- **Assembly: refined.** The paper's is nine to nearly sixty times as far off, for it joins drifts at points, by
+  between drives. 0.25 m, or every scan, gains less than a millimetre on the loop and on the real log, and
+  loses one in the straight drift, for up to two and a half times the CPU and with covariances that are too sure (NEES
+  of 5 to 6 in the mean). 1.5 m loses four millimetres on the loop and two centimetres in the straight drift; 3 m three
+  millimetres on the loop and nearly four on the real log.
+- **Assembly: refined.** The paper's is nine to sixty times as far off, for it joins drifts at points, by
   lengths and headings. It saves no time.
 - **Method: landmark.** Without tags every run is mapped, and here aligned, by itself: one run comes out as well, two
-  of them a little worse, and nothing joins them.
+  of them somewhat worse, and nothing joins them.
 - **Solver: ours.** On the same links, from the same guess, it comes to the same minimum as gtsam in a third of the
   time or less. On the real log neither finds the lowest cost from the open-loop chain at once; with its corner
   falling ours does, and so a map is solved when a lost stretch is found again. The robust cost hardly changes a map,
   since what matches badly never becomes a link. It is there for what slips through: one false link in a hundred puts
-  the plain sum of squares off by four centimetres to metres, the robust cost by less than a millimetre. One linear
+  the plain sum of squares off by ten centimetres to metres, the robust cost by less than a millimetre. One linear
   step is as good where the guess is good, as in a map that grows by stretches of 5 m; from the open-loop chain it is
   five times as far off on the real log.
 """
