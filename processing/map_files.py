@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from hw_profiles.errors import BadInputError
 from processing.geometry import Array
 from processing.occupancy_grid import Grid, StoredGrid, Window
-from processing.stitching import stitch, stitched_window
+from processing.stitching import rows_covered, stitch, stitched_window
 from processing.workers import Workers
 
 Image.MAX_IMAGE_PIXELS = None  # a mine of kilometres is no attack
@@ -29,6 +29,8 @@ BAND_CELLS = 4_000_000  # that are stitched, written and shrunk at once
 MARGIN_PIXELS = 50  # room for the scale bar and the names at the rim
 WALL, OPEN, DARK = (38, 38, 46), (255, 255, 255), (206, 208, 212)
 BLUE, RED, INK = (30, 100, 200), (205, 40, 30), (20, 20, 20)
+
+Band = tuple[slice, list[Grid | StoredGrid], Array]  # rows of a map, the grids that reach them, and where these lie
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +103,13 @@ def stitch_image(grids: Sequence[Grid | StoredGrid], placements: Array, path: Pa
     window = stitched_window(grids, placements)
     (height, width), step = window.shape, band_rows(window.shape[1])
     path.touch()
-    bands = [slice(first, min(first + step, height)) for first in range(0, height, step)]
-    stitch_one = partial(stitch_band, grids=grids, placements=placements, window=window, path=path)
-    known = work.map("map", stitch_one, bands)
+    covered = [rows_covered(grid.window, pose, window) for grid, pose in zip(grids, placements, strict=True)]
+    bands: list[Band] = []
+    for first in range(0, height, step):
+        last = min(first + step, height)
+        met = [k for k, (low, high) in enumerate(covered) if low < last and high > first]
+        bands.append((slice(first, last), [grids[k] for k in met], placements[met]))
+    known = work.map("map", partial(stitch_band, window=window, path=path), bands)
     rows = np.flatnonzero(np.concatenate([np.zeros(0, bool), *(rows for rows, _ in known)]))
     if not len(rows):
         return StoredImage(path, width, (0, 0), window.shape, window.resolution_m, window.origin)
@@ -114,10 +120,9 @@ def stitch_image(grids: Sequence[Grid | StoredGrid], placements: Array, path: Pa
     return StoredImage(path, width, corner, shape, window.resolution_m, origin)
 
 
-def stitch_band(
-    rows: slice, grids: Sequence[Grid | StoredGrid], placements: Array, window: Window, path: Path
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def stitch_band(band_of: Band, window: Window, path: Path) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Write some rows of the file. Returns: of which rows, and which columns, something is known."""
+    rows, grids, placements = band_of
     band = stitch(grids, placements, window.rows(rows))
     with path.open("r+b") as file:
         file.seek(rows.start * window.shape[1])

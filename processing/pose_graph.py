@@ -250,10 +250,11 @@ def boundary_information(poses: Array, links: Links, weights: Array, boundary: I
     weighted = links.informations * weights[:, None, None]
     kept, border = np.zeros((count, count, 3, 3)), np.zeros((len(pattern), count, 3, 3))
     for i, j_i, j, j_j in ((0, j_a, 0, j_a), (0, j_a, 1, j_b), (1, j_b, 0, j_a), (1, j_b, 1, j_b)):
-        row, column = links.ends[:, i], place[links.ends[:, j]]
-        blocks = np.swapaxes(j_i, 1, 2) @ weighted @ j_j
+        at_boundary = np.flatnonzero(place[links.ends[:, j]] >= 0)
+        row, column = links.ends[at_boundary, i], place[links.ends[at_boundary, j]]
+        blocks = np.swapaxes(j_i[at_boundary], 1, 2) @ weighted[at_boundary] @ j_j[at_boundary]
         for matrix, at in ((kept, place[row]), (border, pattern.place[row])):
-            used = (at >= 0) & (column >= 0)
+            used = at >= 0
             np.add.at(matrix, (at[used], column[used]), blocks[used])
     information = kept.swapaxes(1, 2).reshape(3 * count, 3 * count)
     if not len(pattern):

@@ -27,6 +27,12 @@ def stitched_window(grids: Sequence[Grid | StoredGrid], placements: Array) -> Wi
     return Window((height, width), resolution_m, low * resolution_m)
 
 
+def rows_covered(part: Window, pose: Array, whole: Window) -> tuple[int, int]:
+    """The first row of a window that a part placed at `pose` (3,) reaches, and the one after the last."""
+    rows = (_corners(part, pose)[:, 1] - whole.origin[1]) / whole.resolution_m
+    return int(np.floor(rows.min())), int(np.ceil(rows.max()))
+
+
 def stitch(grids: Sequence[Grid | StoredGrid], placements: Array, window: Window | None = None) -> Grid:
     """One grid of many: each placed by its pose in `placements` (k, 3), log-odds added, values in between interpolated.
 
