@@ -135,7 +135,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
         + _joins(paths, firsts)
         + _hops(frames, poses, hop_pairs(frames, range(min(len(paths), STIFF_DRIVES))))
     )
-    loops, known = NO_LINKS, Matches.none()
+    loops, known = NO_LINKS, [Matches.none()]
     present = np.zeros(len(poses), bool)
     strayed = np.zeros((len(poses), 2))  # how far each key frame may have strayed: m, rad
     for path in range(len(paths)):
@@ -153,7 +153,8 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
             )
             if lost:
                 drift = Drift.of(LOST_M, LOST_RAD)
-            known, found = known.joined(closed), placed + closed.links
+            known.append(closed)
+            found = placed + closed.links
             loops = loops + found
             if len(found):
                 poses = solve_present(poses, links + loops, present, held)
@@ -166,7 +167,7 @@ def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
             links = links + _hops(frames, poses, pairs[~np.all(linked[pairs], axis=1)])
         if path < FIRST_DRIVES:  # these move with each other; of more, the last hardly tell the first anything new
             poses = solve_present(poses, links + loops, present, np.zeros(len(poses), bool))
-    return _settle(frames, links, poses, firsts, known)
+    return _settle(frames, links, poses, firsts, Matches.joined(known))
 
 
 def _hops(frames: KeyFrames, poses: Array, pairs: Ints) -> Links:

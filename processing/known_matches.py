@@ -3,13 +3,14 @@
 In: pairs of key frames, and the poses so far. Out: the links that their matches are, old and new.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry import relative, wrap_angle
-from processing.pose_graph import NO_LINKS, Links
+from processing.pose_graph import NO_LINKS, Links, join_links
 from processing.strong_links import LOOP_INLIERS, KeyFrames, match_pairs
 
 Array = NDArray[np.float64]
@@ -30,12 +31,13 @@ class Matches:
     def none() -> "Matches":
         return Matches(np.zeros((0, 2), np.int64), np.zeros((0, 3)), NO_LINKS)
 
-    def joined(self, other: "Matches") -> "Matches":
-        """With those of other pairs."""
-        pairs = np.concatenate([self.pairs, other.pairs])
+    @staticmethod
+    def joined(parts: Sequence["Matches"]) -> "Matches":
+        """Those of different pairs, one part at least."""
+        pairs = np.concatenate([part.pairs for part in parts])
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-        motions = np.concatenate([self.motions, other.motions])
-        return Matches(pairs[order], motions[order], self.links + other.links)
+        motions = np.concatenate([part.motions for part in parts])
+        return Matches(pairs[order], motions[order], join_links([part.links for part in parts]))
 
 
 def match_loops(frames: KeyFrames, poses: Array, pairs: Ints, known: Matches) -> Matches:

@@ -9,6 +9,7 @@ which hold a drive together where a match in its chain was wrong.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,12 +51,7 @@ class Links:
         )
 
     def __add__(self, other: "Links") -> "Links":
-        return Links(
-            np.concatenate([self.ends, other.ends]),
-            np.concatenate([self.motions, other.motions]),
-            np.concatenate([self.informations, other.informations]),
-            np.concatenate([self.robust, other.robust]),
-        )
+        return join_links([self, other])
 
     def __getitem__(self, which: NDArray[np.bool_] | Ints) -> "Links":
         return Links(self.ends[which], self.motions[which], self.informations[which], self.robust[which])
@@ -66,6 +62,16 @@ class Links:
     def shifted(self, by: int) -> "Links":
         """The same links between poses whose numbers are larger by `by`."""
         return Links(self.ends + by, self.motions, self.informations, self.robust)
+
+
+def join_links(parts: Sequence[Links]) -> Links:
+    """All in a row, one part at least."""
+    return Links(
+        np.concatenate([part.ends for part in parts]),
+        np.concatenate([part.motions for part in parts]),
+        np.concatenate([part.informations for part in parts]),
+        np.concatenate([part.robust for part in parts]),
+    )
 
 
 NO_LINKS = Links.of(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), robust=True)

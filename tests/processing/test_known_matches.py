@@ -77,7 +77,7 @@ def test_a_pair_that_did_not_match_is_tried_again_from_elsewhere_alone(
 def test_matches_of_other_pairs_are_joined(frames: tuple[KeyFrames, list[np.ndarray]]) -> None:
     of, guesses = frames
     parts = [match_loops(of, POSES, PAIRS[k : k + 1], Matches.none()) for k in (2, 0, 1)]
-    whole = parts[0].joined(parts[1]).joined(parts[2])
+    whole = Matches.joined(parts)
     again = match_loops(of, POSES, PAIRS, whole)
     assert len(guesses) == 3
     assert_allclose(again.motions, whole.motions)
