@@ -36,28 +36,35 @@ Known = dict[Pair, tuple[Array, ScanMatch]]  # the guess (3,) that a match began
 
 
 @dataclass(frozen=True, slots=True)
+class Meeting:
+    """A key frame of one piece beside one of another."""
+
+    indices: tuple[int, int]  # in the pieces
+    pair: Pair  # the same
+    scans: tuple[StoredScans, StoredScans]  # one scan each
+    guess: Array  # (3,) the second seen from the first
+    known: ScanMatch | None  # that need not be made again
+
+
+@dataclass(frozen=True, slots=True)
 class Overlap:
-    """Key frames of two pieces that lie over each other, k pairs of them."""
+    """Two pieces that lie over each other, and k places where they meet."""
 
     numbers: tuple[int, int]  # of the pieces
     mount: Array  # (3,) scanner in the vehicle
-    indices: list[tuple[int, int]]  # k
-    pairs: list[Pair]  # k, the same
-    scans: list[tuple[StoredScans, StoredScans]]  # k, one scan each
-    guesses: list[Array]  # k of (3,): the second seen from the first
-    known: list[ScanMatch | None]  # k, those that need not be made again
+    meetings: list[Meeting]  # k
 
     def match(self, match: Matcher) -> list[ScanMatch]:
         """k matches, of the vehicle; where none says in all directions how the pieces lie, some are searched for."""
         found = [
-            known or match_vehicles(one[0], other[0], guess, self.mount, match)
-            for (one, other), guess, known in zip(self.scans, self.guesses, self.known, strict=True)
+            of.known or match_vehicles(of.scans[0][0], of.scans[1][0], of.guess, self.mount, match)
+            for of in self.meetings
         ]
         if not any(worth_a_link(of, LOOP_INLIERS) and not is_open(of) for of in found):
             for n in np.unique(np.linspace(0, len(found) - 1, SEARCHES).round().astype(int)).tolist():
-                if self.known[n] is None:
-                    one, other = self.scans[n]
-                    found[n] = find_near(one[0], other[0], self.guesses[n], self.mount) or found[n]
+                of = self.meetings[n]
+                if of.known is None:
+                    found[n] = find_near(of.scans[0][0], of.scans[1][0], of.guess, self.mount) or found[n]
         return found
 
 
@@ -73,18 +80,16 @@ def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[in
             if parts[p] != parts[q]:
                 continue
             distance, near = trees[p].query(views[q], distance_upper_bound=OVERLAP_M)
-            last, overlap = np.full(2, np.inf), Overlap((int(p), q), solved[q].input.mount, [], [], [], [], [])
-            for k in np.flatnonzero(np.isfinite(distance)):
+            last, meetings = np.full(2, np.inf), []
+            for k in np.flatnonzero(np.isfinite(distance)).tolist():
                 if np.hypot(*(poses[q][k, :2] - last)) < OVERLAP_SPACING_M:
                     continue
                 i, last = int(near[k]), poses[q][k, :2]
-                pair, guess = (*solved[p].keyframe(i), *solved[q].keyframe(int(k))), relative(poses[p][i], poses[q][k])
-                overlap.indices.append((i, int(k)))
-                overlap.pairs.append(pair)
-                overlap.scans.append((solved[p].scan(i), solved[q].scan(int(k))))
-                overlap.guesses.append(guess)
-                overlap.known.append(known[pair][1] if pair in known and confirms(guess, *known[pair]) else None)
-            found += [overlap] * bool(overlap.indices)
+                pair, guess = (*solved[p].keyframe(i), *solved[q].keyframe(k)), relative(poses[p][i], poses[q][k])
+                before = known[pair][1] if pair in known and confirms(guess, *known[pair]) else None
+                meetings.append(Meeting((i, k), pair, (solved[p].scan(i), solved[q].scan(k)), guess, before))
+            if meetings:
+                found.append(Overlap((int(p), q), solved[q].input.mount, meetings))
     return found
 
 
@@ -106,13 +111,11 @@ def link_overlaps(overlaps: list[Overlap], boundary: Boundary, match: Matcher, w
     matches = work.map("overlaps", partial(Overlap.match, match=match), overlaps, at_once=10)
     for overlap, found in zip(overlaps, matches, strict=True):
         p, q = overlap.numbers
-        for (i, k), pair, guess, before, seen in zip(
-            overlap.indices, overlap.pairs, overlap.guesses, overlap.known, found, strict=True
-        ):
-            if before is None:
-                known[pair] = guess, seen
+        for of, seen in zip(overlap.meetings, found, strict=True):
+            if of.known is None:
+                known[of.pair] = of.guess, seen
             if worth_a_link(seen, LOOP_INLIERS):
-                a, b = boundary.add(p, i), boundary.add(q, k)
+                a, b = boundary.add(p, of.indices[0]), boundary.add(q, of.indices[1])
                 if a == b:  # the pass that both begin with: nothing between
                     continue
                 ends.append((a, b))
