@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 CHI_SQUARED_3_999 = 16.27  # 99.9 % quantile of chi squared with three degrees of freedom
+TREMBLE_M, TREMBLE_RAD = 0.003, 0.002  # what an engine does to a vehicle that stands is no contradiction
 
 
 @njit(cache=True)
@@ -30,11 +31,13 @@ def fuse(
     """Whether the two agree, and the fused motion (3,) with its covariance (3, 3).
 
     They agree where the squared Mahalanobis distance of the innovation lies within 99.9 %, the odometry's covariance
-    taken `gate` times. The fused motion is less uncertain in every direction than either opinion.
+    taken `gate` times, and as much as a vehicle trembles. The fused motion is less uncertain in every direction than
+    either opinion.
     """
     innovation = matched - expected
     innovation[2] = -((-innovation[2] + math.pi) % (2 * math.pi) - math.pi)
-    spread = gate * expected_covariance + matched_covariance
+    tremble = np.diag(np.array([TREMBLE_M * TREMBLE_M, TREMBLE_M * TREMBLE_M, TREMBLE_RAD * TREMBLE_RAD]))
+    spread = gate * expected_covariance + matched_covariance + tremble
     agrees = innovation @ np.linalg.solve(spread, innovation) <= CHI_SQUARED_3_999
     # K = P_odom (P_odom + P_sm)⁻¹, all symmetric
     gain = np.ascontiguousarray(np.linalg.solve(expected_covariance + matched_covariance, expected_covariance).T)

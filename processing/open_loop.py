@@ -11,38 +11,29 @@ computed anywhere, and only one is in memory.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import OdometryNoise
-from processing.chain_step import carry, join, to_laser, to_vehicle
-from processing.fusion import fuse
-from processing.geometry import accumulate, compose, interpolate_poses, inverse
-from processing.match_search import search_match
+from processing.chain import Chain, Contradiction
+from processing.geometry import accumulate, compose, interpolate_poses, relative
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
 from processing.scan_matching import Matcher
-from processing.scan_walls import Scan
-from processing.sweeps import StoredScans, Sweeps
+from processing.sweeps import StoredScans, Sweeps, velocities_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SEGMENT_SCANS = 1500
-KEYFRAME_SPACING_M = 0.75
-KEYFRAME_TURN_RAD = 0.35
-MIN_INLIERS = 0.6  # fewer of the points that both must see: no match
-ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
-SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
 # What /odom of an unknown robot may be trusted with.
 FOREIGN_NOISE = OdometryNoise(
     distance_m_per_sqrt_m=0.06, lateral_m_per_sqrt_m=0.03, heading_deg_per_sqrt_m=3.0, heading_deg_per_sqrt_deg=1.0
 )
-GATE = 9.0  # wheels err by their radius and by slip, not only at random: three times the standard deviation is let pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +48,7 @@ class OpenLoop:
     reference: Ints  # (n,) which key frame a scan was matched to
     offsets: Array  # (n, 3) pose of a scan in the frame of that key frame
     matched: NDArray[np.bool_]  # (n,) False: odometry alone
+    contradictions: list[Contradiction]  # between wheels and walls, by scan
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -95,73 +87,6 @@ def odometry_at_scans(run: Run) -> Motions:
     return odom_motions(interpolate_poses(run.motion_times, run.odometry, times), FOREIGN_NOISE)
 
 
-class _Chain:
-    """The growing chain of key frames, and where the vehicle is since the last of them."""
-
-    scan: Scan  # of the last key frame
-
-    def __init__(self, count: int, mount: Array, match: Matcher) -> None:
-        self.mount, self.to_scanner, self.match = mount, inverse(mount), match
-        self.keyframes: list[int] = []
-        self.motions: list[Array] = []
-        self.covariances: list[Array] = []
-        self.odometry_motions: list[Array] = []
-        self.odometry_covariances: list[Array] = []
-        self.reference, self.offsets = np.zeros(count, np.int64), np.zeros((count, 3))
-        self.matched = np.zeros(count, bool)
-        self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))  # fused, since the key frame
-        self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))  # by odometry alone, since the key frame
-        self.wants_keyframe = False
-
-    def add_keyframe(self, k: int, scan: Scan) -> None:
-        if self.keyframes:
-            self.motions.append(self.offset)
-            self.covariances.append(self.covariance)
-            self.odometry_motions.append(self.driven)
-            self.odometry_covariances.append(GATE * self.driven_covariance)
-        self.keyframes.append(k)
-        self.scan = scan
-        self.reference[k], self.offsets[k] = len(self.keyframes) - 1, 0.0
-        self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))
-        self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))
-
-    def advance(self, k: int, scan: Scan, step: Array, noise: Array, search: bool) -> bool:
-        """Match scan `k`, one odometry `step` after the last; False leaves all as it was."""
-        driven, covariance = carry(self.driven, self.driven_covariance, step, noise)
-        guess = to_laser(self.mount, self.to_scanner, join(self.offset, step))
-        if search:
-            result = search_match(self.scan, scan, guess, SEARCH_M, SEARCH_RAD)
-        else:
-            result = self.match(self.scan, scan, guess)
-        if not (result.converged and result.inliers >= MIN_INLIERS):
-            return False
-        motion, doubt = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
-        agrees, fused, fused_covariance = fuse(driven, covariance, GATE, motion, doubt)
-        if not agrees:
-            return False
-        if search:  # what had to be searched for may be elsewhere
-            fused_covariance = GATE * covariance
-        self._arrive(k, fused, fused_covariance, driven, covariance, result.overlap)
-        return True
-
-    def coast(self, k: int, step: Array, noise: Array) -> None:
-        """Take odometry's word for scan `k`."""
-        offset, covariance = carry(self.offset, self.covariance, step, GATE * noise)
-        self._arrive(k, offset, covariance, *carry(self.driven, self.driven_covariance, step, noise), 0.0)
-
-    def _arrive(
-        self, k: int, offset: Array, covariance: Array, driven: Array, driven_cov: Array, overlap: float
-    ) -> None:
-        self.offset, self.covariance = offset, covariance
-        self.driven, self.driven_covariance = driven, driven_cov
-        self.reference[k], self.offsets[k], self.matched[k] = len(self.keyframes) - 1, offset, overlap > 0
-        self.wants_keyframe = (
-            np.hypot(offset[0], offset[1]) > KEYFRAME_SPACING_M
-            or abs(offset[2]) > KEYFRAME_TURN_RAD
-            or overlap < ENOUGH_OVERLAP
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A stretch of a run: s scans."""
@@ -184,6 +109,7 @@ class DrivenSegment:
     reference: Ints  # (s,)
     offsets: Array  # (s, 3)
     matched: NDArray[np.bool_]  # (s,)
+    contradictions: list[Contradiction]  # scans counted from the segment's first, too
 
 
 def cut_segments(sweeps: Sweeps, odometry: Motions, forced: Ints) -> list[Segment]:
@@ -202,22 +128,35 @@ def cut_segments(sweeps: Sweeps, odometry: Motions, forced: Ints) -> list[Segmen
 
 
 def drive_segment(segment: Segment, match: Matcher) -> DrivenSegment:
-    """Drive through it once."""
+    """Drive through it; a second time where wheels were convicted, for they bent the sweeps too."""
+    driven = _drive(segment, match)
+    if any(found.convicts_wheels for found in driven.contradictions):
+        poses = compose(accumulate(np.zeros(3), driven.motions)[driven.reference], driven.offsets)
+        driven = _drive(replace(segment, sweeps=straighten_by(segment.sweeps, poses)), match)
+    return driven
+
+
+def straighten_by(sweeps: Sweeps, poses: Array) -> Sweeps:
+    """The sweeps, straightened by the motions between these poses (n, 3)."""
+    return replace(sweeps, velocities=velocities_of(relative(poses[:-1], poses[1:]), sweeps.times))
+
+
+def _drive(segment: Segment, match: Matcher) -> DrivenSegment:
     sweeps, odometry = segment.sweeps, segment.odometry
-    chain = _Chain(len(sweeps), sweeps.mount, match)
+    chain = Chain(len(sweeps), sweeps.mount, match)
+    seconds = np.diff(sweeps.times)
     scans = sweeps.scans(np.arange(len(sweeps)))
     before = next(scans)
     chain.add_keyframe(0, before)
     for k, current in enumerate(scans, start=1):
-        step, noise = odometry.deltas[k - 1], odometry.covariances[k - 1]
-        if not chain.advance(k, current, step, noise, search=False):
+        driven = odometry.deltas[k - 1], odometry.covariances[k - 1], float(seconds[k - 1])
+        if not chain.advance(k, current, *driven, search=False):
             if chain.keyframes[-1] != k - 1:  # too little in common with the key frame; more with the scan before
                 chain.add_keyframe(k - 1, before)
             if not (
-                chain.advance(k, current, step, noise, search=False)
-                or chain.advance(k, current, step, noise, search=True)
+                chain.advance(k, current, *driven, search=False) or chain.advance(k, current, *driven, search=True)
             ):
-                chain.coast(k, step, noise)
+                chain.coast(k, *driven)
         if chain.wants_keyframe or k in segment.cuts:
             chain.add_keyframe(k, current)
         before = current
@@ -232,11 +171,15 @@ def drive_segment(segment: Segment, match: Matcher) -> DrivenSegment:
         chain.reference,
         chain.offsets,
         chain.matched,
+        chain.contradictions,
     )
 
 
 def join_segments(sweeps: Sweeps, odometry: Motions, parts: Sequence[DrivenSegment]) -> OpenLoop:
-    """The whole run. A scan that two segments share is the last of the one and the first key frame of the other."""
+    """The whole run. A scan that two segments share is the last of the one and the first key frame of the other.
+
+    Its sweeps are straightened by the fused motions from now on: wheels that slipped bent them.
+    """
     counts = np.cumsum([0] + [len(part.keyframes) - 1 for part in parts])
     keyframes, reference, offsets, matched = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [], []
     for part, before in zip(parts, counts[:-1], strict=True):
@@ -244,7 +187,7 @@ def join_segments(sweeps: Sweeps, odometry: Motions, parts: Sequence[DrivenSegme
         reference.append(before + part.reference[1:])
         offsets.append(part.offsets[1:])
         matched.append(part.matched[1:])
-    return OpenLoop(
+    loop = OpenLoop(
         odometry,
         sweeps,
         np.concatenate(keyframes),
@@ -253,7 +196,9 @@ def join_segments(sweeps: Sweeps, odometry: Motions, parts: Sequence[DrivenSegme
         np.concatenate(reference),
         np.concatenate([np.zeros((1, 3)), *offsets]),
         np.concatenate([np.zeros(1, bool), *matched]),
+        [replace(found, scan=part.first + found.scan) for part in parts for found in part.contradictions],
     )
+    return replace(loop, sweeps=straighten_by(sweeps, loop.poses))
 
 
 def _in_a_row(motions: list[Array], covariances: list[Array], robust: bool) -> Links:

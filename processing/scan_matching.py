@@ -42,7 +42,7 @@ Matcher = Callable[[Scan, Scan, Array], ScanMatch]  # reference, current, first 
 
 
 @njit(cache=True, error_model="numpy", fastmath=FUSED)
-def _nearest(
+def nearest_wall(
     points: Array,
     normals: Array,
     increment: float,
@@ -151,7 +151,7 @@ def _gauss_newton(
             if seen_at < 0:
                 seen_at += 2 * math.pi
             middle = int(seen_at / increment + 0.5)
-            best = _nearest(ref_points, ref_normals, increment, bent, middle, (x, y, nx, ny, distance), reach)
+            best = nearest_wall(ref_points, ref_normals, increment, bent, middle, (x, y, nx, ny, distance), reach)
             if best < 0:  # gone, or never in the reference's sight: beside its field of view, or behind its walls?
                 if (
                     middle < beams

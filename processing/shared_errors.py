@@ -9,8 +9,8 @@ filter: Jazwinski 1970, section 8.4).
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.chain import GATE
 from processing.edge_map import PieceMap
-from processing.open_loop import GATE
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

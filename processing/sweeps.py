@@ -30,6 +30,7 @@ class Sweeps:
     """n sweeps of B beams."""
 
     ranges: NDArray[np.float32] | Ranges  # (n, B) m; +inf no return, NaN invalid
+    times: Array  # (n,) s, of the first ray
     velocities: Array  # (n, 3) of the vehicle at each sweep: ahead, left [m/s], turn [rad/s]
     mount: Array  # (3,) scanner in the vehicle
     angle_min: float
@@ -74,18 +75,26 @@ class Sweeps:
         """Sweeps `first` to `last`, the last included."""
         kept = slice(first, last + 1)
         ranges = self.ranges.cut(first, last) if isinstance(self.ranges, Ranges) else self.ranges[kept]
-        return replace(self, ranges=ranges, velocities=self.velocities[kept])
+        return replace(self, ranges=ranges, times=self.times[kept], velocities=self.velocities[kept])
 
 
 def sweeps_of(scans: Scans, odometry: Motions, mount: Array) -> Sweeps:
     """The sweeps of a run; `odometry` (n - 1) between them."""
-    velocities = np.zeros((len(scans.times), 3))
-    if len(scans.times) > 1:
-        seconds = np.diff(scans.times)
+    velocities = velocities_of(odometry.deltas, scans.times)
+    return Sweeps(
+        scans.ranges, scans.times, velocities, mount, scans.angle_min, scans.angle_increment, scans.time_increment_s
+    )
+
+
+def velocities_of(motions: Array, times: Array) -> Array:
+    """(n, 3) of the vehicle at each of `times` (n,), from the motions (n - 1, 3) between them."""
+    velocities = np.zeros((len(times), 3))
+    if len(times) > 1:
+        seconds = np.diff(times)
         seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
-        velocities[:-1] = odometry.deltas / seconds[:, None]
+        velocities[:-1] = motions / seconds[:, None]
         velocities[-1] = velocities[-2]
-    return Sweeps(scans.ranges, velocities, mount, scans.angle_min, scans.angle_increment, scans.time_increment_s)
+    return velocities
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from processing.chain import GATE
 from processing.edge_map import PieceMap
-from processing.open_loop import GATE
 from processing.pose_graph import Links, marginal_covariances, solve
 from processing.shared_errors import scale_errors
 

@@ -50,13 +50,16 @@ def a_run(
     )
     loop = OpenLoop(
         odometry=Motions(np.zeros((count - 1, 3)), np.zeros((count - 1, 3, 3))),
-        sweeps=Sweeps(np.zeros((count, 2), np.float32), np.zeros((count, 3)), np.zeros(3), 0.0, 0.1, 0.0),
+        sweeps=Sweeps(
+            np.zeros((count, 2), np.float32), np.zeros(count), np.zeros((count, 3)), np.zeros(3), 0.0, 0.1, 0.0
+        ),
         keyframes=np.arange(count),
         links=NO_LINKS,
         wheels=NO_LINKS,
         reference=np.arange(count),
         offsets=np.zeros((count, 3)),
         matched=np.ones(count, bool),
+        contradictions=[],
     )
     return run, loop
 

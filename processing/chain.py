@@ -1,0 +1,194 @@
+"""The chain of key frames of a drive, with two witnesses: the wheels and the walls, each believed as far as it can see.
+
+In: scans in a row, and each time how the wheels moved. Out: key frames, the fused motions between them, and the
+stretches in which a witness was convicted.
+
+    do they agree?                          both, as eq. (3) weighs them
+    they do not, and the walls object to    the wheels are convicted: the walls decide where they see, and where they
+    the wheels' pose wherever one looks     see nothing, the wheels and the motion so far, with ample doubt
+    they do not, and the walls fit the      the scan is convicted: it may be moved along the way from the one pose to
+    wheels' pose nearly as well             the other, so there the wheels decide; across it the walls still do
+
+A match starts from the wheels, and where these contradict it or nothing is found there, from the motion so far too: a
+vehicle cannot change its motion at once, wheels can. So a slip, a stuck or a reset encoder costs its own stretch.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.chain_step import carry, invert, join, to_laser, to_vehicle
+from processing.fusion import fuse
+from processing.match_search import agreement, search_match
+from processing.objection import objection
+from processing.scan_match import ScanMatch
+from processing.scan_matching import Matcher
+from processing.scan_walls import Scan
+
+Array = NDArray[np.float64]
+
+KEYFRAME_SPACING_M = 0.75
+KEYFRAME_TURN_RAD = 0.35
+MIN_INLIERS = 0.6  # fewer of the points that both must see: no match
+ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
+SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
+GATE = 9.0  # wheels err by their radius and by slip, not only at random: three times the standard deviation is let pass
+OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them; smooth ones differ by 0.005
+SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
+STEP_M, STEP_RAD = 0.05, 0.03  # what a match and a stamp may be off, besides
+AWRY = (0.3, 0.3, 0.2)  # m, m, rad: what convicted wheels may be off in one step, where the walls show nothing
+SLIPPED = (0.05, 0.05, 0.02)  # m, m, rad: and where the walls do
+STEADY_M_S2, STEADY_RAD_S2 = 1.0, 1.0  # how fast motions usually change
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """A scan at which wheels and walls contradicted each other, and who was convicted."""
+
+    scan: int
+    convicts_wheels: bool
+    missed: Array  # (3,) what the wheels would have been off, or the scan
+
+
+class Chain:
+    """The growing chain, and where the vehicle is since its last key frame."""
+
+    scan: Scan  # of the last key frame
+
+    def __init__(self, count: int, mount: Array, match: Matcher) -> None:
+        self.mount, self.to_scanner, self.match = mount, invert(mount), match
+        self.keyframes: list[int] = []
+        self.motions: list[Array] = []
+        self.covariances: list[Array] = []
+        self.odometry_motions: list[Array] = []
+        self.odometry_covariances: list[Array] = []
+        self.contradictions: list[Contradiction] = []
+        self.reference, self.offsets = np.zeros(count, np.int64), np.zeros((count, 3))
+        self.matched = np.zeros(count, bool)
+        self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))  # fused, since the key frame
+        self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))  # by odometry alone, since the key frame
+        self.velocity: Array | None = None  # (3,) of the last step, m/s and rad/s
+        self.wants_keyframe = False
+
+    def add_keyframe(self, k: int, scan: Scan) -> None:
+        if self.keyframes:
+            self.motions.append(self.offset)
+            self.covariances.append(self.covariance)
+            self.odometry_motions.append(self.driven)
+            self.odometry_covariances.append(GATE * self.driven_covariance)
+        self.keyframes.append(k)
+        self.scan = scan
+        self.reference[k], self.offsets[k] = len(self.keyframes) - 1, 0.0
+        self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))
+        self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))
+
+    def advance(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float, search: bool) -> bool:
+        """Match scan `k`, one odometry `step` and `seconds` after the last; False leaves all as it was."""
+        driven, doubt = carry(self.driven, self.driven_covariance, step, noise)
+        onward = self._onward(step, seconds)
+        result = self._match(scan, join(self.offset, step), search)
+        if _is_good(result):
+            motion, covariance = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+            agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
+            if agrees:
+                if search:  # what had to be searched for may be elsewhere
+                    fused_covariance = GATE * doubt
+                self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
+                return True
+        tried = [result] if self.velocity is None else [result, self._match(scan, join(self.offset, onward), search)]
+        good = [of for of in tried if _is_good(of) and self._is_possible(of, onward, seconds)]
+        if not good:
+            return False
+        best = max(good, key=agreement)
+        return self._judge(k, scan, best, step, onward, driven, doubt, seconds)
+
+    def _judge(
+        self,
+        k: int,
+        scan: Scan,
+        result: ScanMatch,
+        step: Array,
+        onward: Array,
+        driven: Array,
+        doubt: Array,
+        seconds: float,
+    ) -> bool:
+        """The wheels contradict a match, or led to none: who of the two is right?"""
+        motion, covariance = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+        agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
+        if agrees:
+            self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
+            return True
+        missed = motion - driven
+        missed[2] = math.remainder(missed[2], 2 * math.pi)
+        deviations = math.sqrt(missed @ np.linalg.solve(GATE * doubt, missed))
+        by_wheels = driven + missed / max(deviations, 1.0)  # as near to the match as honest wheels may be
+        against = objection(self.scan, scan, result.motion, to_laser(self.mount, self.to_scanner, by_wheels))
+        if against >= OBJECTS:
+            prior, prior_doubt = self._without_wheels(step, onward, seconds)
+            _, fused, fused_covariance = fuse(prior, prior_doubt, GATE, motion, covariance)
+            self.contradictions.append(Contradiction(k, True, missed))
+            # from here on the wheels count from where the walls put the vehicle
+            slipped = doubt + np.outer(missed, missed) + np.diag(np.square(SLIPPED))
+            self._arrive(k, fused, fused_covariance, fused, slipped, result.overlap, seconds)
+            return True
+        open_covariance = covariance + 1e2 * np.outer(missed, missed)
+        _, fused, fused_covariance = fuse(driven, doubt, GATE, motion, open_covariance)
+        self.contradictions.append(Contradiction(k, False, missed))
+        self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
+        return True
+
+    def coast(self, k: int, step: Array, noise: Array, seconds: float) -> None:
+        """Take odometry's word for scan `k`."""
+        offset, covariance = carry(self.offset, self.covariance, step, GATE * noise)
+        self._arrive(k, offset, covariance, *carry(self.driven, self.driven_covariance, step, noise), 0.0, seconds)
+
+    def _match(self, scan: Scan, guess: Array, search: bool) -> ScanMatch:
+        at = to_laser(self.mount, self.to_scanner, guess)
+        if search:
+            return search_match(self.scan, scan, at, SEARCH_M, SEARCH_RAD)
+        return self.match(self.scan, scan, at)
+
+    def _onward(self, step: Array, seconds: float) -> Array:
+        """The next step of a vehicle that keeps its motion."""
+        return step if self.velocity is None else self.velocity * seconds
+
+    def _is_possible(self, result: ScanMatch, onward: Array, seconds: float) -> bool:
+        """Could the vehicle have got there from its motion so far?"""
+        if self.velocity is None:
+            return True
+        motion, _ = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+        moved = join(invert(join(self.offset, onward)), motion)
+        far = SPEED_UP_M_S2 * seconds**2 + STEP_M + 3 * math.sqrt(self.covariance[0, 0] + self.covariance[1, 1])
+        turned = TURN_UP_RAD_S2 * seconds**2 + STEP_RAD + 3 * math.sqrt(self.covariance[2, 2])
+        return math.hypot(moved[0], moved[1]) < far and abs(moved[2]) < turned
+
+    def _without_wheels(self, step: Array, onward: Array, seconds: float) -> tuple[Array, Array]:
+        """Where convicted wheels and the motion so far put the vehicle together, and with what doubt."""
+        spread = np.diag(np.square(AWRY))
+        if self.velocity is None:
+            return join(self.offset, step), self.covariance + spread
+        change = np.array([STEADY_M_S2, 0.2 * STEADY_M_S2, STEADY_RAD_S2]) * seconds**2
+        steady = np.diag(np.square(change + np.array([1e-3, 1e-3, 1e-3])))
+        _, moved, doubt = fuse(onward, steady, GATE, step, spread)
+        return carry(self.offset, self.covariance, moved, doubt)
+
+    def _arrive(
+        self, k: int, offset: Array, covariance: Array, driven: Array, doubt: Array, overlap: float, seconds: float
+    ) -> None:
+        if seconds > 0:
+            self.velocity = join(invert(self.offset), offset) / seconds
+        self.offset, self.covariance = offset, covariance
+        self.driven, self.driven_covariance = driven, doubt
+        self.reference[k], self.offsets[k], self.matched[k] = len(self.keyframes) - 1, offset, overlap > 0
+        self.wants_keyframe = (
+            np.hypot(offset[0], offset[1]) > KEYFRAME_SPACING_M
+            or abs(offset[2]) > KEYFRAME_TURN_RAD
+            or overlap < ENOUGH_OVERLAP
+        )
+
+
+def _is_good(result: ScanMatch) -> bool:
+    return bool(result.converged and result.inliers >= MIN_INLIERS)
