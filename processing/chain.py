@@ -58,7 +58,7 @@ class Chain:
     scan: Scan  # of the last key frame
 
     def __init__(self, count: int, mount: Array, match: Matcher) -> None:
-        self.mount, self.to_scanner, self.match = mount, invert(mount), match
+        self.mount, self.match = mount, match
         self.keyframes: list[int] = []
         self.motions: list[Array] = []
         self.covariances: list[Array] = []
@@ -90,7 +90,7 @@ class Chain:
         onward = self._onward(step, seconds)
         result = self._match(scan, join(self.offset, step), search)
         if _is_good(result):
-            motion, covariance = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+            motion, covariance = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
             agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
             if agrees:
                 if search:  # what had to be searched for may be elsewhere
@@ -116,7 +116,7 @@ class Chain:
         seconds: float,
     ) -> bool:
         """The wheels contradict a match, or led to none: who of the two is right?"""
-        motion, covariance = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+        motion, covariance = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
         agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
         if agrees:
             self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
@@ -125,7 +125,7 @@ class Chain:
         missed[2] = math.remainder(missed[2], 2 * math.pi)
         deviations = math.sqrt(missed @ np.linalg.solve(GATE * doubt, missed))
         by_wheels = driven + missed / max(deviations, 1.0)  # as near to the match as honest wheels may be
-        against = objection(self.scan, scan, result.motion, to_laser(self.mount, self.to_scanner, by_wheels))
+        against = objection(self.scan, scan, result.motion, to_laser(self.mount, self.mount, by_wheels))
         if against >= OBJECTS:
             prior, prior_doubt = self._without_wheels(step, onward, seconds)
             _, fused, fused_covariance = fuse(prior, prior_doubt, GATE, motion, covariance)
@@ -146,7 +146,7 @@ class Chain:
         self._arrive(k, offset, covariance, *carry(self.driven, self.driven_covariance, step, noise), 0.0, seconds)
 
     def _match(self, scan: Scan, guess: Array, search: bool) -> ScanMatch:
-        at = to_laser(self.mount, self.to_scanner, guess)
+        at = to_laser(self.mount, self.mount, guess)
         if search:
             return search_match(self.scan, scan, at, SEARCH_M, SEARCH_RAD)
         return self.match(self.scan, scan, at)
@@ -159,7 +159,7 @@ class Chain:
         """Could the vehicle have got there from its motion so far?"""
         if self.velocity is None:
             return True
-        motion, _ = to_vehicle(self.mount, self.to_scanner, result.motion, result.covariance)
+        motion, _ = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
         moved = join(invert(join(self.offset, onward)), motion)
         far = SPEED_UP_M_S2 * seconds**2 + STEP_M + 3 * math.sqrt(self.covariance[0, 0] + self.covariance[1, 1])
         turned = TURN_UP_RAD_S2 * seconds**2 + STEP_RAD + 3 * math.sqrt(self.covariance[2, 2])

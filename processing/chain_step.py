@@ -38,19 +38,21 @@ def carry(pose: Array, covariance: Array, step: Array, noise: Array) -> tuple[Ar
 
 
 @njit(cache=True)
-def to_laser(mount: Array, to_vehicle: Array, motion: Array) -> Array:
-    """A motion (3,) of the vehicle as one of the laser at `mount`; `to_vehicle` is the inverse of the mount."""
-    return join(to_vehicle, join(motion, mount))
+def to_laser(first: Array, second: Array, motion: Array) -> Array:
+    """From a vehicle with its laser at `first` (3,) to one with its laser at `second`, or the same one later: a motion
+    (3,) of the vehicles as that of their lasers.
+    """
+    return join(invert(first), join(motion, second))
 
 
 @njit(cache=True)
-def to_vehicle(mount: Array, from_laser: Array, motion: Array, covariance: Array) -> tuple[Array, Array]:
-    """A motion (3,) of the laser and its covariance (3, 3) as the vehicle's; `from_laser` is the inverse of the
-    mount.
+def to_vehicle(first: Array, second: Array, motion: Array, covariance: Array) -> tuple[Array, Array]:
+    """The way back: a motion (3,) from the laser at `first` to the laser at `second`, and its covariance (3, 3), as the
+    vehicles'.
     """
-    moved = join(join(mount, motion), from_laser)
-    c, s, cm, sm = math.cos(moved[2]), math.sin(moved[2]), math.cos(mount[2]), math.sin(mount[2])
+    moved = join(join(first, motion), invert(second))
+    c, s, cm, sm = math.cos(moved[2]), math.sin(moved[2]), math.cos(first[2]), math.sin(first[2])
     jacobian = np.array(
-        [[cm, -sm, s * mount[0] + c * mount[1]], [sm, cm, -c * mount[0] + s * mount[1]], [0.0, 0.0, 1.0]]
+        [[cm, -sm, s * second[0] + c * second[1]], [sm, cm, -c * second[0] + s * second[1]], [0.0, 0.0, 1.0]]
     )
     return moved, jacobian @ covariance @ jacobian.T

@@ -125,9 +125,9 @@ class Drift:
         return min(3 * self.variance_rad2**0.5 + 0.003 * self.way_m, MAX_DRIFT_RAD)
 
 
-def map_piece(paths: list[Path], mount: Array, match: Matcher) -> PieceMap:
+def map_piece(paths: list[Path], match: Matcher) -> PieceMap:
     """Find strong links and solve until they settle. The first pose of the first path stays where it starts."""
-    frames, chain, firsts = _join(paths, mount, match)
+    frames, chain, firsts = _join(paths, match)
     poses = np.concatenate([accumulate(path.start, path.chain.motions) for path in paths])
     links = (
         chain
@@ -247,17 +247,18 @@ def solve_present(
     return solved
 
 
-def _join(paths: list[Path], mount: Array, match: Matcher) -> tuple[KeyFrames, Links, Ints]:
+def _join(paths: list[Path], match: Matcher) -> tuple[KeyFrames, Links, Ints]:
     firsts = np.cumsum([0] + [len(path.scans) for path in paths])
     chain = paths[0].chain
     for path, first in zip(paths[1:], firsts[1:], strict=False):
         chain = chain + path.chain.shifted(int(first))
     travelled = [np.append(0.0, np.cumsum(np.hypot(*path.chain.motions[:, :2].T))) for path in paths]
+    scans = [scan for path in paths for scan in path.scans]
     frames = KeyFrames(
-        scans=[scan for path in paths for scan in path.scans],
+        scans=scans,
         drive=np.repeat(np.arange(len(paths)), np.diff(firsts)),
         travelled=np.concatenate(travelled),
-        mount=mount,
+        mounts=np.array([scan.mount for scan in scans]),
         match=match,
     )
     return frames, chain, firsts

@@ -74,7 +74,8 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
         p = piece.path_of(index)
         first, last = piece.ends(p)
         reach_m = piece.input.piece.spans[p].reaches_m[index == last]
-        return Passing(piece.map.poses[first : last + 1], piece.input.paths[p].scans, index - first, reach_m)
+        mount = piece.input.sights[p].sweeps.mount
+        return Passing(piece.map.poses[first : last + 1], piece.input.paths[p].scans, mount, index - first, reach_m)
 
     edges = [(variables[0], v) for variables in boundary.variables for v in variables]
     shape = (boundary.count, boundary.count)
@@ -84,7 +85,7 @@ def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
         linked: list[int] = []
         for v in passes:
             for u in [u for u in linked if part[u] != part[v]][:3]:
-                found = register_passes(passing(u), passing(v), solved[0].input.mount)
+                found = register_passes(passing(u), passing(v))
                 if found is not None:
                     ends.append((u, v))
                     motions.append(found.motion)

@@ -96,9 +96,9 @@ class _Track:
 
 
 def _sees_the_same(reference: MappedRun, i: int, run: MappedRun, k: int, match: Matcher) -> bool:
-    i, k = facing(reference.poses, i, run.poses, k, run.mount)
+    i, k = facing(reference.poses, i, run.poses, k, (reference.mount, run.mount))
     guess = relative(reference.poses[i], run.poses[k])
-    return worth_a_link(match_vehicles(reference.scans[i], run.scans[k], guess, run.mount, match), LOOP_INLIERS)
+    return worth_a_link(match_vehicles(reference.scans[i], run.scans[k], guess, match), LOOP_INLIERS)
 
 
 def _silent_pass(epc: str, run: MappedRun, k: int) -> Pass:

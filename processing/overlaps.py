@@ -51,26 +51,22 @@ class Overlap:
     """Two pieces that lie over each other, and k places where they meet."""
 
     numbers: tuple[int, int]  # of the pieces
-    mount: Array  # (3,) scanner in the vehicle
     meetings: list[Meeting]  # k
 
     def match(self, match: Matcher) -> list[ScanMatch]:
         """k matches, of the vehicle; where none says in all directions how the pieces lie, some are searched for."""
-        found = [
-            of.known or match_vehicles(of.scans[0][0], of.scans[1][0], of.guess, self.mount, match)
-            for of in self.meetings
-        ]
+        found = [of.known or match_vehicles(of.scans[0][0], of.scans[1][0], of.guess, match) for of in self.meetings]
         if not any(worth_a_link(of, LOOP_INLIERS) and not is_open(of) for of in found):
             for n in np.unique(np.linspace(0, len(found) - 1, SEARCHES).round().astype(int)).tolist():
                 of = self.meetings[n]
                 if of.known is None:
-                    found[n] = find_near(of.scans[0][0], of.scans[1][0], of.guess, self.mount) or found[n]
+                    found[n] = find_near(of.scans[0][0], of.scans[1][0], of.guess) or found[n]
         return found
 
 
 def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[int], known: Known) -> list[Overlap]:
     poses = [compose(frame, piece.map.poses) for frame, piece in zip(frames, solved, strict=True)]
-    views = [viewpoints(of, piece.input.mount) for of, piece in zip(poses, solved, strict=True)]
+    views = [viewpoints(of, piece.mounts) for of, piece in zip(poses, solved, strict=True)]
     trees = [cKDTree(of) for of in views]
     low = np.array([of.min(axis=0) for of in views]) - OVERLAP_M
     high = np.array([of.max(axis=0) for of in views])
@@ -89,7 +85,7 @@ def find_overlaps(solved: list[SolvedPiece], frames: list[Array], parts: list[in
                 before = known[pair][1] if pair in known and confirms(guess, *known[pair]) else None
                 meetings.append(Meeting((i, k), pair, (solved[p].scan(i), solved[q].scan(k)), guess, before))
             if meetings:
-                found.append(Overlap((int(p), q), solved[q].input.mount, meetings))
+                found.append(Overlap((int(p), q), meetings))
     return found
 
 

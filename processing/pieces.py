@@ -41,7 +41,6 @@ class PieceInput:
     piece: Piece
     paths: tuple[Path, ...]
     sights: tuple[Sight, ...]
-    mount: Array  # (3,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +58,11 @@ class SolvedPiece:
         p = self.path_of(index)
         path = self.input.paths[p]
         return path.run_id, int(path.keyframes[index - int(self.map.firsts[p])])
+
+    @property
+    def mounts(self) -> Array:
+        """(N, 3) of the scanners of all key frames in their vehicles."""
+        return np.repeat([sight.sweeps.mount for sight in self.input.sights], np.diff(self.map.firsts), axis=0)
 
     def path_of(self, index: int) -> int:
         return int(np.searchsorted(self.map.firsts, index, side="right")) - 1
@@ -89,7 +93,7 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
         scans=[path.scans for path in given.paths],
         ends=[(span.start, span.end) for span in given.piece.spans],
         reaches_m=[span.reaches_m for span in given.piece.spans],
-        mount=given.mount,
+        mounts=[sight.sweeps.mount for sight in given.sights],
     )
     out = []
     for number, leader in enumerate(dict.fromkeys(groups)):
@@ -100,7 +104,6 @@ def split_drifts(given: PieceInput) -> list[PieceInput]:
                 replace(given.piece, spans=tuple(given.piece.spans[p] for p in chosen)),
                 tuple(replace(given.paths[p], start=starts[p], start_doubt_m=doubts_m[p]) for p in chosen),
                 tuple(given.sights[p] for p in chosen),
-                given.mount,
             )
         )
     return out
@@ -119,14 +122,14 @@ def rename(parts: list[SolvedPiece], name: str) -> list[SolvedPiece]:
 
 
 def solve_piece(given: PieceInput, match: Matcher) -> list[SolvedPiece]:
-    return [SolvedPiece(part, map_piece(list(part.paths), part.mount, match)) for part in split_drifts(given)]
+    return [SolvedPiece(part, map_piece(list(part.paths), match)) for part in split_drifts(given)]
 
 
 def draw_piece(given: PieceInput, firsts: Ints, poses: Array, resolution_m: float) -> Grid:
     """The occupancy grid of a piece, in the frame of the key frames' poses (N, 3)."""
     views = []
     for p, sight in enumerate(given.sights):
-        laser = compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), given.mount)
+        laser = compose(compose(poses[firsts[p] + sight.keyframe], sight.offsets), sight.sweeps.mount)
         ranges = sight.sweeps.ranges[sight.rows]
         views.append(View(laser, sight.sweeps.straighten(ranges, sight.rows), ranges, sight.sweeps.angles))
     return build_grid(views, resolution_m)

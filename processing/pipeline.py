@@ -29,7 +29,6 @@ from processing.open_loop import (
     cut_segments,
     drive_segment,
     join_segments,
-    mount_pose,
 )
 from processing.pieces import PieceInput, SolvedPiece, cut_span, rename, solve_piece
 from processing.polar_matching import match_polar
@@ -136,7 +135,7 @@ def piece_names(graph: Graph) -> list[str]:
 def piece_input(name: str, piece: Piece, runs: list[DrivenRun]) -> PieceInput:
     cuts = [cut_span(runs[s.run].run.run_id, runs[s.run].loop, s) for s in piece.spans]
     paths, sights = (tuple(column) for column in zip(*cuts, strict=True))
-    return PieceInput(name, piece, paths, sights, mount_pose(runs[piece.spans[0].run].run))
+    return PieceInput(name, piece, paths, sights)
 
 
 def draw(

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from processing.chain_step import to_laser, to_vehicle
 from processing.geometry import accumulate, compose, compose_jacobians, inverse, relative, wrap_angle
 from processing.match_search import agreement, search_match
 from processing.pose_graph import Links
-from processing.scan_match import ScanMatch, through_mount
+from processing.scan_match import ScanMatch
 from processing.scan_matching import CLOSEST_M, match_scans
 from processing.scan_walls import Scan
 from processing.strong_links import extreme_variances, facing
@@ -40,6 +41,7 @@ class Passing:
 
     poses: Array  # (K, 3) in any frame
     scans: Sequence[Scan]  # K
+    mount: Array  # (3,) of their scanner in the vehicle
     index: int  # of the pass
     reach_m: float = 0.0  # how far its tag is read
 
@@ -53,11 +55,11 @@ def is_open(match: ScanMatch) -> bool:
     return extreme_variances(match.covariance)[1] > SEEN_M**2
 
 
-def register_passes(reference: Passing, current: Passing, mount: Array) -> ScanMatch | None:
+def register_passes(reference: Passing, current: Passing) -> ScanMatch | None:
     """The motion from one pass to another; None where the scans do not tell all of it, or not which way the vehicle
     faced: between smooth walls a drift looks like the next.
     """
-    found = pass_hypotheses(reference, current, mount, QUARTERS)
+    found = pass_hypotheses(reference, current, QUARTERS)
     if not found or is_open(found[0][1]):
         return None
     worth, best = found[0]
@@ -66,7 +68,7 @@ def register_passes(reference: Passing, current: Passing, mount: Array) -> ScanM
 
 
 def pass_hypotheses(
-    reference: Passing, current: Passing, mount: Array, headings: Sequence[float] = (0.0, np.pi)
+    reference: Passing, current: Passing, headings: Sequence[float] = (0.0, np.pi)
 ) -> list[tuple[float, ScanMatch]]:
     """Motions of the vehicle from one pass of a tag to another, one for each heading that fits, and what each is worth;
     the better first.
@@ -77,9 +79,9 @@ def pass_hypotheses(
     for heading in headings:
         guess = np.array([0.0, 0.0, heading])
         there = compose(compose(compose(reference.pose, guess), inverse(current.pose)), current.poses)
-        i, k = facing(reference.poses, reference.index, there, current.index, mount)
+        i, k = facing(reference.poses, reference.index, there, current.index, (reference.mount, current.mount))
         guess = relative(reference.poses[i], there[k])
-        weighed = _search_around(reference.scans[i], current.scans[k], guess, mount, radius_m)
+        weighed = _search_around(reference.scans[i], current.scans[k], guess, radius_m)
         if weighed is not None:
             before, after = relative(reference.pose, reference.poses[i]), relative(current.poses[k], current.pose)
             found.append((weighed[0], _between(before, weighed[1], after)))
@@ -96,10 +98,10 @@ def _between(before: Array, match: ScanMatch, after: Array) -> ScanMatch:
 
 
 def _search_around(
-    reference: Scan, current: Scan, guess: Array, mount: Array, radius_m: float = SEARCH_M
+    reference: Scan, current: Scan, guess: Array, radius_m: float = SEARCH_M
 ) -> tuple[float, ScanMatch] | None:
     """The best match around a guess, of the vehicle, and its worth."""
-    match = search_match(reference, current, compose(inverse(mount), compose(guess, mount)), radius_m, SEARCH_RAD)
+    match = search_match(reference, current, to_laser(reference.mount, current.mount, guess), radius_m, SEARCH_RAD)
     if not (match.converged and match.inliers >= MIN_INLIERS):
         return None
     # What the other scan should have seen counts as well: one step from there looks without going anywhere.
@@ -107,15 +109,15 @@ def _search_around(
     worth = min(agreement(match), agreement(back))
     if worth <= MIN_WORTH:
         return None
-    motion, covariance = through_mount(mount, match.motion, match.covariance)
+    motion, covariance = to_vehicle(reference.mount, current.mount, match.motion, match.covariance)
     return worth, replace(match, motion=motion, covariance=covariance)
 
 
-def find_near(reference: Scan, current: Scan, guess: Array, mount: Array) -> ScanMatch | None:
+def find_near(reference: Scan, current: Scan, guess: Array) -> ScanMatch | None:
     """The motion of the vehicle from one scan to another, by a guess (3,) that is metres off; None where they do not
     tell all of it.
     """
-    found = _search_around(reference, current, guess, mount)
+    found = _search_around(reference, current, guess)
     return None if found is None or is_open(found[1]) else found[1]
 
 
@@ -124,7 +126,7 @@ def path_starts(
     scans: list[Sequence[Scan]],  # per path
     ends: list[tuple[int | None, int | None]],  # nodes at the first and last key frame of each path
     reaches_m: list[tuple[float, float]],  # how far the tags there are read
-    mount: Array,
+    mounts: list[Array],  # (3,) of the scanner of each path
 ) -> tuple[list[Array], list[int], list[float]]:
     """The start of each path (3,) in the frame of the first path of its group, each path's group, and how far off its
     start may be [m]: nothing where scans told it.
@@ -137,7 +139,7 @@ def path_starts(
     doubts_m: list[float] = []
     for p in range(len(chains)):
         for leader in dict.fromkeys(groups):
-            placed = _place_beside(leader, p, poses, scans, ends, reaches_m, mount)
+            placed = _place_beside(leader, p, poses, scans, ends, reaches_m, mounts)
             if placed is not None:
                 groups.append(leader)
                 starts.append(placed[0])
@@ -157,7 +159,7 @@ def _place_beside(
     scans: list[Sequence[Scan]],
     ends: list[tuple[int | None, int | None]],
     reaches_m: list[tuple[float, float]],
-    mount: Array,
+    mounts: list[Array],
 ) -> tuple[Array, float] | None:
     """The start of path `b` in the frame of path `a`, by the nodes that both touch, and how far off it may be [m].
 
@@ -181,15 +183,15 @@ def _place_beside(
 
     places: list[tuple[bool, float, Array]] = []
     for end_a, end_b in shared:
-        one = Passing(poses[a], scans[a], end_a % len(poses[a]), reaches_m[a][end_a])
-        other = Passing(poses[b], scans[b], end_b % len(poses[b]), reaches_m[b][end_b])
+        one = Passing(poses[a], scans[a], mounts[a], end_a % len(poses[a]), reaches_m[a][end_a])
+        other = Passing(poses[b], scans[b], mounts[b], end_b % len(poses[b]), reaches_m[b][end_b])
         if by_tags is None:  # the tags lie together: nothing but clear scans says how the paths lie
-            clear = register_passes(one, other, mount)
+            clear = register_passes(one, other)
             found = [(1.0, clear)] if clear is not None else []
         else:
             turn, doubt_rad = by_tags
             heading = float(wrap_angle(turn + poses[b][end_b][2] - poses[a][end_a][2]))
-            found = pass_hypotheses(one, other, mount, likely_headings(heading, doubt_rad))
+            found = pass_hypotheses(one, other, likely_headings(heading, doubt_rad))
         for worth, match in found:
             start = compose(compose(poses[a][end_a], match.motion), inverse(poses[b][end_b]))
             if worth > SURE_WORTH and not is_open(match) and fits(start):

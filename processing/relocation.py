@@ -51,17 +51,17 @@ def _points(scan: Scan) -> Array:
 
 
 def relocate(
-    scan: Scan, field: NDArray[np.uint8], origin: Array, guess: Array, mount: Array, radius_m: float, radius_rad: float
+    scan: Scan, field: NDArray[np.uint8], origin: Array, guess: Array, radius_m: float, radius_rad: float
 ) -> tuple[Array, float]:
     """The best pose (3,) of the vehicle around `guess`, and the share of the scan's points that lie on walls there."""
     points = _points(scan)
     reach = float(np.hypot(*points.T).max(initial=1.0))
     turns = np.arange(-radius_rad, radius_rad + 1e-9, CELL_M / reach)
-    laser = compose(guess, mount)
+    laser = compose(guess, scan.mount)
     start, headings = (laser[:2] - origin) / CELL_M, laser[2] + turns
     (dx, dy, k), value = search_window(field, start, headings, points / CELL_M, radius_m / CELL_M)
     turned = laser + np.array([dx * CELL_M, dy * CELL_M, turns[k]])
-    found = compose(turned, inverse(mount))
+    found = compose(turned, inverse(scan.mount))
     return found, value / (4.0 * max(len(points), 1))
 
 
@@ -77,19 +77,19 @@ def relocate_stretch(
     known = known[np.hypot(*(poses[known, :2] - middle).T) < radius_m + MAX_RANGE_M]
     if len(known) < 2 or len(stretch) < 2:
         return NO_LINKS
-    field, origin = likelihood_field([frames.scans[k] for k in known], compose(poses[known], frames.mount))
+    field, origin = likelihood_field([frames.scans[k] for k in known], compose(poses[known], frames.mounts[known]))
     ends, motions, informations, shifts, worths = [], [], [], [], []
     tries = stretch[np.unique(np.linspace(0, len(stretch) - 1, TRIES).astype(int))]
     for k in tries:
-        place, share = relocate(frames.scans[k], field, origin, poses[k], frames.mount, radius_m, radius_rad)
+        place, share = relocate(frames.scans[k], field, origin, poses[k], radius_m, radius_rad)
         if share < MIN_SHARE:
             continue
-        off = viewpoints(poses[known], frames.mount) - viewpoints(place[None], frames.mount)
+        off = viewpoints(poses[known], frames.mounts[known]) - viewpoints(place[None], frames.mounts[k])
         order = np.argsort(np.hypot(*off.T), kind="stable")
         tried = []
         for near in known[order[:NEIGHBOURS]]:
             guess = relative(poses[near], place)
-            found = match_vehicles(frames.scans[near], frames.scans[k], guess, frames.mount, frames.match)
+            found = match_vehicles(frames.scans[near], frames.scans[k], guess, frames.match)
             tried.append((score(found), int(near), found))
         worth, i, found = max(tried, key=lambda of: of[0])
         if worth < MIN_SCORE:

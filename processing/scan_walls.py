@@ -22,6 +22,7 @@ SMOOTH_M = 2.0  # a wall this far straight, to as much as noise lets one see, is
 CHANCE = 2.0  # standard deviations by which its residuals may exceed the noise
 GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ see no wall, or see it at less than 10°
 BEARING_RAD = 2.5e-4  # how far off `bearing` may be
+AT_ORIGIN = np.zeros(3)
 FUSED = {"contract", "nsz", "arcp"}  # what compilers may do to sums and quotients; NaN stays NaN
 
 
@@ -35,6 +36,7 @@ class Scan:
     angle_min: float
     angle_increment: float
     bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
+    mount: Array  # (3,) where the scanner sits in its vehicle: runs of one mine have different ones
 
 
 @njit(cache=True, error_model="numpy", fastmath=FUSED)
@@ -157,9 +159,9 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
     return bent + BEARING_RAD
 
 
-def prepare_scan(points: Array, angle_min: float, angle_increment: float) -> Scan:
+def prepare_scan(points: Array, angle_min: float, angle_increment: float, mount: Array = AT_ORIGIN) -> Scan:
     """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     normals, variances = np.empty_like(points), np.empty_like(points)
     bent_rad = _fit_walls(points, angle_min, angle_increment, normals, variances)
-    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad)
+    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad, mount)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from processing.chain_step import invert, to_laser, to_vehicle
+from processing.chain_step import to_laser, to_vehicle
 from processing.geometry import compose, relative
 from processing.pose_graph import Links
 from processing.scan_match import ScanMatch
@@ -48,7 +48,7 @@ class KeyFrames:
     scans: list[Scan]
     drive: Ints  # (N,) which drive each belongs to
     travelled: Array  # (N,) m since the start of its drive
-    mount: Array  # (3,) scanner in the vehicle
+    mounts: Array  # (N, 3) scanner in the vehicle
     match: Matcher
 
 
@@ -65,17 +65,21 @@ def hop_pairs(frames: KeyFrames, drives: Iterable[int]) -> Ints:
     return np.unique(np.concatenate(pairs), axis=0)
 
 
-def viewpoints(poses: Array, mount: Array) -> Array:
-    """What key frames look at (n, 2): VIEW_M before their scanners. Those that drove the same way see the same walls
-    where they stand side by side, those that drove opposite ways where their scanners face each other.
+def viewpoints(poses: Array, mounts: Array) -> Array:
+    """What key frames look at (n, 2): VIEW_M before their scanners at `mounts`, (3,) or (n, 3).
+
+    Those that drove the same way see the same walls where they stand side by side, those that drove opposite ways where
+    their scanners face each other.
     """
-    return np.asarray(compose(compose(poses, mount), np.array([VIEW_M, 0.0, 0.0]))[:, :2])
+    return np.asarray(compose(compose(poses, mounts), np.array([VIEW_M, 0.0, 0.0]))[:, :2])
 
 
-def facing(one: Array, i: int, other: Array, k: int, mount: Array) -> tuple[int, int]:
-    """The key frames of two drives near i and k that look at the same walls; poses (n, 3) and (m, 3) in one frame."""
+def facing(one: Array, i: int, other: Array, k: int, mounts: tuple[Array, Array]) -> tuple[int, int]:
+    """The key frames of two drives near i and k that look at the same walls; poses (n, 3) and (m, 3) in one frame, and
+    the mounts of their scanners.
+    """
     near_i, near_k = _neighbours(one, i), _neighbours(other, k)
-    first, second = viewpoints(one[near_i], mount), viewpoints(other[near_k], mount)
+    first, second = viewpoints(one[near_i], mounts[0]), viewpoints(other[near_k], mounts[1])
     apart = np.hypot(*np.moveaxis(first[:, None] - second[None], -1, 0))
     away = np.hypot(*(one[near_i] - one[i])[:, :2].T)[:, None] + np.hypot(*(other[near_k] - other[k])[:, :2].T)
     best = np.unravel_index(int(np.argmin(apart + NEARER * away)), apart.shape)
@@ -97,7 +101,7 @@ def loop_pairs(frames: KeyFrames, poses: Array, new: Ints, old: Ints, radius_m: 
     """
     if len(old) == 0 or len(new) == 0:
         return np.empty((0, 2), np.int64)
-    views = viewpoints(poses, frames.mount)
+    views = viewpoints(poses, frames.mounts)
     tree = cKDTree(views[old])
     pairs = []
     for i, near in zip(new, tree.query_ball_point(views[new], radius_m), strict=True):
@@ -132,13 +136,11 @@ def match_vehicles(
     reference: Scan,
     current: Scan,
     guess: Array,
-    mount: Array,
     match: Matcher,
 ) -> ScanMatch:
-    """Match two scans; guess and result are motions of the vehicle."""
-    from_laser = invert(mount)
-    found = match(reference, current, to_laser(mount, from_laser, guess))
-    motion, covariance = to_vehicle(mount, from_laser, found.motion, found.covariance)
+    """Match two scans; guess and result are motions of the vehicle, or from one vehicle to another."""
+    found = match(reference, current, to_laser(reference.mount, current.mount, guess))
+    motion, covariance = to_vehicle(reference.mount, current.mount, found.motion, found.covariance)
     return replace(found, motion=motion, covariance=covariance)
 
 
@@ -162,7 +164,7 @@ def match_pairs(frames: KeyFrames, poses: Array, pairs: Ints, min_inliers: float
     ends, motions, covariances = [], [], []
     guesses = relative(poses[pairs[:, 0]], poses[pairs[:, 1]])
     for (i, j), guess in zip(pairs.tolist(), guesses, strict=True):
-        found = match_vehicles(frames.scans[i], frames.scans[j], guess, frames.mount, frames.match)
+        found = match_vehicles(frames.scans[i], frames.scans[j], guess, frames.match)
         if worth_a_link(found, min_inliers):
             ends.append((i, j))
             motions.append(found.motion)

@@ -63,13 +63,13 @@ class Sweeps:
 
     def scan(self, row: int) -> Scan:
         """Ready for matching."""
-        return prepare_scan(self.points(slice(row, row + 1))[0], self.angle_min, self.angle_increment)
+        return prepare_scan(self.points(slice(row, row + 1))[0], self.angle_min, self.angle_increment, self.mount)
 
     def scans(self, rows: Ints) -> Iterator[Scan]:
         """The same, of many."""
         for start in range(0, len(rows), AT_ONCE):
             for points in self.points(rows[start : start + AT_ONCE]):
-                yield prepare_scan(points, self.angle_min, self.angle_increment)
+                yield prepare_scan(points, self.angle_min, self.angle_increment, self.mount)
 
     def cut(self, first: int, last: int) -> "Sweeps":
         """Sweeps `first` to `last`, the last included."""

@@ -14,7 +14,6 @@ from processing.beacons import Pass
 from processing.edge_placement import Placement
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
-from processing.open_loop import mount_pose
 from processing.registration import Passing, register_passes
 from processing.scan_matching import Matcher
 from processing.trajectory import keyframe_poses
@@ -36,11 +35,11 @@ def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[di
 
     def passing(of: PassId) -> Passing:
         loop, centre = staying[of[0]].loop, staying[of[0]].passes[of[1]].centre
-        return Passing(open_loop[of[0]], loop.scans, int(np.searchsorted(loop.keyframes, centre)))
+        return Passing(open_loop[of[0]], loop.scans, loop.sweeps.mount, int(np.searchsorted(loop.keyframes, centre)))
 
     @cache
     def same_walls(first: PassId, second: PassId) -> bool:
-        return register_passes(passing(first), passing(second), mount_pose(staying[first[0]].run)) is not None
+        return register_passes(passing(first), passing(second)) is not None
 
     moved = find_moved([_open_passes(run) for run in staying], same_walls)
     reasons = dict.fromkeys(riding, RIDES) | dict.fromkeys(moved, MOVED)
@@ -90,7 +89,7 @@ def add_missed(runs: list["DrivenRun"], placed: Placement, match: Matcher) -> li
             keyframe_poses(placed.pieces, number, len(run.loop.keyframes)),
             run.loop.scans,
             parts[number],
-            mount_pose(run.run),
+            run.loop.sweeps.mount,
         )
         for number, run in enumerate(runs)
     ]

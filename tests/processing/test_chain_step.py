@@ -36,10 +36,22 @@ def test_poses_and_their_covariances_are_carried_on(rng: np.random.Generator) ->
 def test_motions_pass_through_the_mount_both_ways(rng: np.random.Generator) -> None:
     mount, motion, covariance = random_pose(rng), random_pose(rng), random_covariance(rng)
     expected, spread = through_mount(mount, motion, covariance)
-    moved, grown = to_vehicle(mount, inverse(mount), motion, covariance)
+    moved, grown = to_vehicle(mount, mount, motion, covariance)
     assert_allclose(moved[:2], expected[:2], atol=1e-12)
     assert_allclose(wrap_angle(moved[2] - expected[2]), 0, atol=1e-12)
     assert_allclose(grown, spread, atol=1e-12)
-    back = to_laser(mount, inverse(mount), moved)
+    back = to_laser(mount, mount, moved)
     assert_allclose(back[:2], motion[:2], atol=1e-12)
     assert_allclose(wrap_angle(back[2] - motion[2]), 0, atol=1e-12)
+
+
+def test_motions_pass_from_one_vehicle_to_another(rng: np.random.Generator) -> None:
+    first, second, motion, covariance = (*(random_pose(rng) for _ in range(3)), random_covariance(rng))
+    moved, grown = to_vehicle(first, second, motion, covariance)
+    expected = compose(compose(first, motion), inverse(second))
+    assert_allclose(moved[:2], expected[:2], atol=1e-12)
+    assert_allclose(wrap_angle(to_laser(first, second, moved) - motion)[2], 0, atol=1e-12)
+    assert_allclose(to_laser(first, second, moved)[:2], motion[:2], atol=1e-12)
+    _, j_motion = compose_jacobians(first, motion)
+    j_both, _ = compose_jacobians(compose(first, motion), inverse(second))
+    assert_allclose(grown, j_both @ j_motion @ covariance @ j_motion.T @ j_both.T, atol=1e-12)

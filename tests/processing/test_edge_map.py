@@ -17,7 +17,6 @@ from processing.edge_map import (
 )
 from processing.geometry import accumulate, align, compose, relative, wrap_angle
 from processing.graph import Graph
-from processing.open_loop import mount_pose
 from processing.pieces import SolvedPiece
 from processing.pipeline import DrivenRun
 from processing.pose_graph import Links
@@ -65,13 +64,13 @@ def turn_aside(path: Path, at: int, radians: float) -> Path:
 
 def frames_along(x: np.ndarray, drive: np.ndarray) -> KeyFrames:
     """Key frames without scans, for what is chosen by place alone."""
-    return KeyFrames([], drive, x, np.zeros(3), match_scans)
+    return KeyFrames([], drive, x, np.zeros((len(x), 3)), match_scans)
 
 
 def test_a_run_that_meets_its_own_beginning_closes(driven: list[DrivenRun], truth: list[np.ndarray]) -> None:
     """Without any tag: a loop of 140 m and half of it again."""
     path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
-    piece = map_piece([path], mount_pose(driven[0].run), match_scans)
+    piece = map_piece([path], match_scans)
     open_loop = accumulate(np.zeros(3), path.chain.motions)
     assert off(piece.poses, true).max() < 0.08
     assert off(piece.poses, true).max() < 0.5 * off(open_loop, true).max()
@@ -87,7 +86,7 @@ def test_a_chain_with_a_wrong_turn_is_mended(driven: list[DrivenRun], truth: lis
     path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
     astray = turn_aside(path, 60, 0.2)
     bent = off(accumulate(np.zeros(3), astray.chain.motions), true).max()
-    piece = map_piece([astray], mount_pose(driven[0].run), match_scans)
+    piece = map_piece([astray], match_scans)
     assert bent > 2.0
     assert off(piece.poses, true).max() < 0.1
     assert not np.any(np.all(piece.links.ends == [60, 61], axis=1) & piece.links.robust)  # the liar is gone
@@ -104,7 +103,7 @@ def test_strong_links_that_lie_bend_nothing(driven: list[DrivenRun], truth: list
         return replace(found, motion=found.motion + lie)
 
     path, true = whole_run(driven[0]), truth[0][driven[0].loop.keyframes]
-    piece = map_piece([path], mount_pose(driven[0].run), liar)
+    piece = map_piece([path], liar)
     assert off(piece.poses, true).max() < 0.12
 
 
@@ -144,7 +143,7 @@ def test_a_poor_start_of_a_second_path_is_made_good(
     piece = next(piece for piece in solved[1] if len(piece.input.paths) > 1)
     first, second = piece.input.paths[:2]
     poor = replace(second, start=compose(second.start, np.array(error)))
-    found = map_piece([first, poor], piece.input.mount, match_scans)
+    found = map_piece([first, poor], match_scans)
     assert off(found.poses, true_keyframes(piece, driven)[: len(found.poses)]).max() < 0.06
 
 
@@ -152,7 +151,7 @@ def test_two_key_frames_are_a_piece(driven: list[DrivenRun]) -> None:
     """The shortest spur: from the start of a run to a tag beside it."""
     loop = driven[0].loop
     path = Path("short", np.arange(2), loop.scans[:2], loop.links[np.arange(1)], loop.wheels[np.arange(1)], np.zeros(3))
-    piece = map_piece([path], mount_pose(driven[0].run), match_scans)
+    piece = map_piece([path], match_scans)
     assert piece.firsts.tolist() == [0, 2]
     gap = relative(piece.poses[0], piece.poses[1]) - loop.links.motions[0]
     assert np.hypot(*gap[:2]) < 0.01
@@ -160,11 +159,11 @@ def test_two_key_frames_are_a_piece(driven: list[DrivenRun]) -> None:
 
 def test_a_blind_scanner_leaves_the_wheels(driven: list[DrivenRun]) -> None:
     """No scan holds anything: the piece is what odometry makes of it, and no link is invented."""
-    loop, mount = driven[0].loop, mount_pose(driven[0].run)
+    loop = driven[0].loop
     blind = replace(loop.scans[0], points=np.full((541, 2), np.nan), normals=np.full((541, 2), np.nan))
     path = whole_run(driven[0])
     wheels = Links(path.wheels.ends, path.wheels.motions, path.wheels.informations, np.ones(len(path.wheels), bool))
-    piece = map_piece([replace(path, scans=[blind] * len(loop.scans), chain=wheels)], mount, match_scans)
+    piece = map_piece([replace(path, scans=[blind] * len(loop.scans), chain=wheels)], match_scans)
     assert_allclose(piece.poses[:, :2], accumulate(np.zeros(3), path.wheels.motions)[:, :2], atol=1e-3)
     assert len(piece.links) == 2 * len(path.wheels)
 
@@ -241,9 +240,7 @@ def test_many_drives_through_one_place_lie_over_each_other(driven: list[DrivenRu
     rng, copies = np.random.default_rng(2), FIRST_DRIVES + 4
     starts = [np.zeros(3), *rng.normal(0, [0.3, 0.1, 0.02], (copies - 1, 3))]
     bent = [turn_aside(first, 20 + k, 0.01 * (-1) ** k) for k in range(copies)]
-    piece = map_piece(
-        [replace(of, start=at) for of, at in zip(bent, starts, strict=True)], mount_pose(driven[0].run), match_scans
-    )
+    piece = map_piece([replace(of, start=at) for of, at in zip(bent, starts, strict=True)], match_scans)
     assert off(piece.poses, np.tile(true[:count], (copies, 1))).max() < 0.1
 
 
@@ -251,7 +248,7 @@ def test_later_drives_are_stiff_where_they_are_alone(driven: list[DrivenRun]) ->
     """The third drive over the same ground goes on where the first two ended."""
     path = whole_run(driven[0])
     drives = [beginning(path, count) for count in (40, 40, 60)]
-    piece = map_piece(drives, mount_pose(driven[0].run), match_scans)
+    piece = map_piece(drives, match_scans)
     ends = piece.links.ends[piece.strong]
     for first, last in ((0, 40), (40, 80)):
         assert np.sum(np.all((ends >= first) & (ends < last), axis=1)) > 60

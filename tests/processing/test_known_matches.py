@@ -38,7 +38,7 @@ def frames() -> tuple[KeyFrames, list[np.ndarray]]:
         return match_scans(reference, current, guess)
 
     scans = [look(pose) for pose in POSES]
-    return KeyFrames(scans, np.arange(4), np.zeros(4), np.zeros(3), match), guesses
+    return KeyFrames(scans, np.arange(4), np.zeros(4), np.zeros((4, 3)), match), guesses
 
 
 def test_what_the_poses_confirm_is_not_matched_again(frames: tuple[KeyFrames, list[np.ndarray]]) -> None:

@@ -38,7 +38,7 @@ def look(segments: np.ndarray, poses: np.ndarray, seed: int) -> list:
         ranges = cast(grid, origins, laser[2] + ANGLES, 20.0) + rng.normal(0, 0.01, len(ANGLES))
         ranges = np.where(np.isfinite(ranges) & (ranges < 20), ranges, np.nan)
         points = np.stack([ranges * np.cos(ANGLES), ranges * np.sin(ANGLES)], axis=-1)
-        scans.append(prepare_scan(points, ANGLES[0], ANGLES[1] - ANGLES[0]))
+        scans.append(prepare_scan(points, ANGLES[0], ANGLES[1] - ANGLES[0], MOUNT))
     return scans
 
 
@@ -51,14 +51,14 @@ def drive() -> tuple[KeyFrames, np.ndarray]:
     poses = np.concatenate([there, back])
     scans = look(walls(3), poses, 1)
     travelled = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    return KeyFrames(scans, np.zeros(16, np.int64), travelled, MOUNT, match_scans), poses
+    return KeyFrames(scans, np.zeros(16, np.int64), travelled, np.tile(MOUNT, (16, 1)), match_scans), poses
 
 
 def test_a_scan_is_found_metres_and_half_a_radian_away(drive: tuple[KeyFrames, np.ndarray]) -> None:
     frames, poses = drive
     field, origin = likelihood_field(frames.scans[:8], compose(poses[:8], MOUNT))
     wrong = poses[12] + np.array([3.0, -2.0, 0.45])
-    found, share = relocate(frames.scans[12], field, origin, wrong, MOUNT, 5.0, 0.6)
+    found, share = relocate(frames.scans[12], field, origin, wrong, 5.0, 0.6)
     assert_allclose(found[:2], poses[12, :2], atol=0.3)
     assert abs(wrap_angle(found[2] - poses[12, 2])) < 0.05
     assert share > 0.7
@@ -77,5 +77,5 @@ def test_a_stretch_that_is_lost_gets_links_to_where_it_is(drive: tuple[KeyFrames
 def test_a_stretch_of_another_place_is_not_found(drive: tuple[KeyFrames, np.ndarray]) -> None:
     frames, poses = drive
     elsewhere = look(walls(17), poses[8:] + np.array([0.0, 9.0, 0.0]), 2)
-    mixed = KeyFrames(frames.scans[:8] + elsewhere, frames.drive, frames.travelled, MOUNT, match_scans)
+    mixed = KeyFrames(frames.scans[:8] + elsewhere, frames.drive, frames.travelled, frames.mounts, match_scans)
     assert len(relocate_stretch(mixed, poses, np.arange(8, 16), np.arange(8), 6.0, 0.6)) == 0

@@ -56,24 +56,28 @@ def test_drives_both_ways_are_matched_where_their_scanners_face_each_other(ahead
     """Scanners that look away from each other see no wall in common, above all in a narrow drift."""
     mount = np.array([ahead_m, 0.0, 0.0 if ahead_m > 0 else np.pi])
     looks = np.sign(ahead_m)
-    frames = KeyFrames([], np.repeat([0, 1], 60), np.tile(np.arange(0, 30, 0.5), 2), mount, match_scans)
+    frames = KeyFrames(
+        [], np.repeat([0, 1], 60), np.tile(np.arange(0, 30, 0.5), 2), np.tile(mount, (120, 1)), match_scans
+    )
     pairs = loop_pairs(frames, np.vstack([OUT, BACK]), np.arange(60, 120), np.arange(60), 1.0)
     assert len(pairs) > 30
     scanners = OUT[pairs[:, 0], 0] + ahead_m, BACK[pairs[:, 1] - 60, 0] - ahead_m
     assert_allclose(looks * (scanners[1] - scanners[0])[1:-1], 2 * VIEW_M, atol=0.51)
-    i, k = facing(OUT, 30, BACK, 30, mount)
+    i, k = facing(OUT, 30, BACK, 30, (mount, mount))
     assert_allclose(looks * (BACK[k, 0] - ahead_m - OUT[i, 0] - ahead_m), 2 * VIEW_M, atol=0.51)
 
 
 def test_drives_the_same_way_are_matched_side_by_side() -> None:
     beside = OUT + np.array([0.2, 0.5, 0.01])
-    assert facing(OUT, 30, beside, 30, np.array([1.5, 0.0, 0.0])) == (30, 30)
+    assert facing(OUT, 30, beside, 30, (np.array([1.5, 0.0, 0.0]), np.array([1.5, 0.0, 0.0]))) == (30, 30)
 
 
 def test_of_many_drives_the_nearest_of_the_first_are_matched() -> None:
     beside_m = np.array([0.9, 0.1, 0.5, 0.3, 0.7, 0.2, 0.8, 0.4])
     drives = [OUT + np.array([0.0, y, 0.0]) for y in beside_m]
-    frames = KeyFrames([], np.repeat(np.arange(9), 60), np.tile(np.arange(0, 30, 0.5), 9), np.zeros(3), match_scans)
+    frames = KeyFrames(
+        [], np.repeat(np.arange(9), 60), np.tile(np.arange(0, 30, 0.5), 9), np.zeros((540, 3)), match_scans
+    )
     pairs = loop_pairs(frames, np.vstack([*drives, OUT]), np.arange(480, 540), np.arange(480), 2.5)
     nearest = set(np.argsort(beside_m[:FIRST_DRIVES])[:MOST_LOOPS].tolist())
     for new in range(480, 540):

@@ -145,6 +145,7 @@ def test_scans_between_key_frames_go_with_theirs() -> None:
         reference=reference,
         offsets=relative(true[[0, 5]][reference], true),
         matched=loop.matched,
+        contradictions=[],
     )
     moved = compose(np.array([1.0, 2.0, -3.0]), true)
     _, poses = run_trajectory(run, sparse, moved[[0, 5]])
