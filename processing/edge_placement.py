@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from processing.boundary import Boundary, find_boundary
 from processing.condensed import Condensed, condense
@@ -19,9 +17,10 @@ from processing.geometry import align, compose, inverse, relative
 from processing.graph import Graph
 from processing.linked_paths import TAG_INFORMATION, TagJoin, join_groups, merge_groups, split_groups
 from processing.overlaps import Known, find_overlaps, link_overlaps
+from processing.part_joining import Join, join_parts, tag_links
 from processing.pieces import SolvedPiece
+from processing.placed_drives import find_tag_passes, place_drives
 from processing.pose_graph import Links, Solution, solve
-from processing.registration import Passing, register_passes
 from processing.scan_matching import Matcher
 from processing.workers import Workers
 
@@ -29,6 +28,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 OVERLAP_ROUNDS = 2
+SURE_LINKS = 5  # between two parts: so many scan matches hold them together, whatever a tag says
 PART_GAP_M = 20.0  # the range of the scanner, so that grids do not touch either
 
 
@@ -63,37 +63,6 @@ def condense_all(solved: list[SolvedPiece], boundary: Boundary) -> list[Condense
     ]
 
 
-def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
-    """Links between passes of one tag in parts of the map that no run joins: all else is joined without guessing."""
-    seen_in: dict[int, tuple[SolvedPiece, int]] = {}
-    for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
-        seen_in |= {v: (piece, i) for v, i in zip(variables, indices, strict=True)}
-
-    def passing(variable: int) -> Passing:
-        piece, index = seen_in[variable]
-        p = piece.path_of(index)
-        first, last = piece.ends(p)
-        reach_m = piece.input.piece.spans[p].reaches_m[index == last]
-        mount = piece.input.sights[p].sweeps.mount
-        return Passing(piece.map.poses[first : last + 1], piece.input.paths[p].scans, mount, index - first, reach_m)
-
-    edges = [(variables[0], v) for variables in boundary.variables for v in variables]
-    shape = (boundary.count, boundary.count)
-    part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
-    ends, motions, informations = [], [], []
-    for passes in boundary.passes_of_nodes().values():
-        linked: list[int] = []
-        for v in passes:
-            for u in [u for u in linked if part[u] != part[v]][:3]:
-                found = register_passes(passing(u), passing(v))
-                if found is not None:
-                    ends.append((u, v))
-                    motions.append(found.motion)
-                    informations.append(np.linalg.inv(found.covariance))
-            linked.append(v)
-    return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
-
-
 def link_tags(joins: list[TagJoin], boundary: Boundary) -> Links:
     """Links of what tags alone say of groups of paths; their poses are passes, so they are in the boundary."""
     ends = [tuple(boundary.add(g, index) for g, index in zip(of.groups, of.indices, strict=True)) for of in joins]
@@ -120,33 +89,79 @@ def bend(
 def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, work: Workers, known: Known) -> Placement:
     """The refined assembly: least squares of all that the pieces know of each other, then the pieces bent to fit.
 
+    Tags come before looks: what overlaps is searched for where the tags have put the pieces.
+
     `known`: overlaps matched before, for the assembly that comes after this one.
     """
     groups = split_groups(solved)
     pieces = [group.solved for group in groups]
     boundary = find_boundary(pieces)
     condensed = condense_all(pieces, boundary)
-    links = link_nodes(pieces, boundary) + link_tags(join_groups(groups), boundary)
+    links = link_tags(join_groups(groups), boundary)
     poses, part, frames = lay_out(condensed, links, boundary.count)
+    passes = find_tag_passes(pieces, boundary, graph)
+    links = links + tag_links(passes, part, [piece.variables for piece in condensed])
     poses, _ = solve_frames(poses, condensed, links, _first_of_each(part))
     frames = [fit_frame(piece, poses) for piece in condensed]
+    joined = join_parts(place_drives(pieces, frames, [int(part[of.variables[0]]) for of in condensed]), passes)
+    thin: list[tuple[Join, Ints]] = []  # what hangs together by one tag, and the parts of the pieces before
+    for join in joined.joins:
+        links = links + join.links
+        if len(join.nodes) == 1:
+            thin.append((join, np.array([part[piece.variables[0]] for piece in condensed])))
+        frames = [
+            compose(join.move, frame) if part[piece.variables[0]] == join.parts[1] else frame
+            for frame, piece in zip(frames, condensed, strict=True)
+        ]
+        part = np.where(part == join.parts[1], join.parts[0], part)
+    part = np.unique(part, return_inverse=True)[1]
     parts = [int(part[piece.variables[0]]) for piece in condensed]
+    poses, _ = solve_frames(spread_out(condensed, frames, boundary.count), condensed, links, _first_of_each(part))
+    frames = [fit_frame(piece, poses) for piece in condensed]
     for _ in range(OVERLAP_ROUNDS):
         grown = find_boundary(pieces)
         overlaps = find_overlaps(pieces, frames, parts, known)
         more = links + link_overlaps(overlaps, grown, match, work, known)
         condensed = condense_all(pieces, grown)
-        poses, part, _ = lay_out(condensed, more, grown.count)
-        poses, weights = solve_frames(poses, condensed, more, _first_of_each(part))
+        poses = spread_out(condensed, frames, grown.count)
+        poses, weights = solve_frames(poses, condensed, more, _first_of_each(_parts_of(condensed, parts, grown.count)))
         frames, boundary = [fit_frame(piece, poses) for piece in condensed], grown
-        parts = [int(part[piece.variables[0]]) for piece in condensed]
     bent = bend(pieces, boundary, poses, frames, work)
     doubted = int((weights < 0.1).sum())
-    notes = [f"{doubted} of {len(more)} links between pieces contradict the rest and were left out"] if doubted else []
+    of_variable = {int(v): p for p, piece in enumerate(condensed) for v in piece.variables}
+    believed = more.ends[len(links) :][weights[len(links) :] > 0.5]
+    linked = np.array([(of_variable[a], of_variable[b]) for a, b in believed.tolist()], np.int64).reshape(-1, 2)
+    notes = [_tell_join(join, graph) for join, before in thin if _links_between(join, before[linked]) < SURE_LINKS]
+    notes += [f"{doubted} of {len(more)} links between pieces contradict the rest and were left out"] * (doubted > 0)
     homes = {v: part for variables, part in zip(boundary.variables, parts, strict=True) for v in variables}
     of_pieces = dict(reversed([(group.piece, part) for group, part in zip(groups, parts, strict=True)]))
     merged = merge_groups(solved, groups, bent)
     return _settle(merged, [of_pieces[p] for p in range(len(solved))], boundary, homes, poses, graph, notes)
+
+
+def _links_between(join: Join, parts: Ints) -> int:
+    """How many of the links, between pieces of these parts (m, 2), join the two parts as well."""
+    return int(np.all(np.sort(parts, axis=1) == np.sort(join.parts), axis=1).sum())
+
+
+def _tell_join(join: Join, graph: Graph) -> str:
+    return f"parts of the map are joined by tag {graph.nodes[join.nodes[0]].epc} alone"
+
+
+def spread_out(pieces: list[Condensed], frames: list[Array], count: int) -> Array:
+    """Poses (V, 3) of all variables, where the frames of the pieces put them."""
+    poses = np.zeros((count, 3))
+    for piece, frame in zip(pieces, frames, strict=True):
+        poses[piece.variables] = compose(frame, piece.local)
+    return poses
+
+
+def _parts_of(pieces: list[Condensed], parts: list[int], count: int) -> Ints:
+    """The part (V,) of every variable."""
+    part = np.zeros(count, np.int64)
+    for piece, of in zip(pieces, parts, strict=True):
+        part[piece.variables] = of
+    return part
 
 
 def fit_frame(piece: Condensed, poses: Array) -> Array:

@@ -11,11 +11,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processing.assembly import Assembly, assemble_paper, turn_from_headings
-from processing.boundary import find_boundary
-from processing.edge_placement import Placed, Placement, lay_side_by_side, link_nodes, remark_parts
+from processing.boundary import Boundary, find_boundary
+from processing.edge_placement import Placed, Placement, lay_side_by_side, remark_parts
 from processing.geometry import compose, inverse, relative
 from processing.graph import Graph
 from processing.pieces import SolvedPiece
+from processing.pose_graph import Links
+from processing.registration import Passing, register_passes
 from processing.scan_matching import Matcher
 from processing.workers import Workers
 
@@ -69,6 +71,37 @@ def place_by_lengths(solved: list[SolvedPiece], graph: Graph, _match: Matcher, _
             if node_parts[node] < 0:
                 nodes[node], node_parts[node] = of.poses[index], of.part
     return Placement(placed, nodes, node_parts, _remarks(solved, edges, assembly) + remark_parts(parts))
+
+
+def link_nodes(solved: list[SolvedPiece], boundary: Boundary) -> Links:
+    """Links between passes of one tag in parts of the map that no run joins: all else is joined without guessing."""
+    seen_in: dict[int, tuple[SolvedPiece, int]] = {}
+    for piece, variables, indices in zip(solved, boundary.variables, boundary.indices, strict=True):
+        seen_in |= {v: (piece, i) for v, i in zip(variables, indices, strict=True)}
+
+    def passing(variable: int) -> Passing:
+        piece, index = seen_in[variable]
+        p = piece.path_of(index)
+        first, last = piece.ends(p)
+        reach_m = piece.input.piece.spans[p].reaches_m[index == last]
+        mount = piece.input.sights[p].sweeps.mount
+        return Passing(piece.map.poses[first : last + 1], piece.input.paths[p].scans, mount, index - first, reach_m)
+
+    edges = [(variables[0], v) for variables in boundary.variables for v in variables]
+    shape = (boundary.count, boundary.count)
+    part = connected_components(coo_array((np.ones(len(edges)), tuple(np.array(edges).T)), shape=shape))[1]
+    ends, motions, informations = [], [], []
+    for passes in boundary.passes_of_nodes().values():
+        linked: list[int] = []
+        for v in passes:
+            for u in [u for u in linked if part[u] != part[v]][:3]:
+                found = register_passes(passing(u), passing(v))
+                if found is not None:
+                    ends.append((u, v))
+                    motions.append(found.motion)
+                    informations.append(np.linalg.inv(found.covariance))
+            linked.append(v)
+    return Links.of(np.array(ends), np.array(motions), np.array(informations), robust=True)
 
 
 def _links_of_passes(solved: list[SolvedPiece]) -> list[tuple[Key, Key, Array]]:
