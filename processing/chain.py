@@ -24,7 +24,7 @@ from processing.fusion import fuse
 from processing.match_search import agreement, search_match
 from processing.objection import objection
 from processing.scan_match import ScanMatch
-from processing.scan_matching import Matcher
+from processing.scan_matching import LEVER_M, Matcher
 from processing.scan_walls import Scan
 
 Array = NDArray[np.float64]
@@ -35,7 +35,10 @@ MIN_INLIERS = 0.6  # fewer of the points that both must see: no match
 ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
 SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
 GATE = 9.0  # wheels err by their radius and by slip, not only at random: three times the standard deviation is let pass
-OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them; smooth ones differ by 0.005
+HONEST = 3.0  # standard deviations that wheels may be off without being at fault
+OPEN = 100.0  # of what the two witnesses differ by, squared: the doubt of a match that may as well be moved so far
+OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them
+NEUTRAL = 0.005  # smooth walls, which fit there as well, differ by less
 SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
 STEP_M, STEP_RAD = 0.05, 0.03  # what a match and a stamp may be off, besides
 AWRY = (0.3, 0.3, 0.2)  # m, m, rad: what convicted wheels may be off in one step, where the walls show nothing
@@ -50,6 +53,14 @@ class Contradiction:
     scan: int
     convicts_wheels: bool
     missed: Array  # (3,) what the wheels would have been off, or the scan
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Since the last key frame, in its frame."""
+
+    pose: Array  # (3,)
+    covariance: Array  # (3, 3)
 
 
 class Chain:
@@ -86,70 +97,78 @@ class Chain:
 
     def advance(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float, search: bool) -> bool:
         """Match scan `k`, one odometry `step` and `seconds` after the last; False leaves all as it was."""
-        driven, doubt = carry(self.driven, self.driven_covariance, step, noise)
-        onward = self._onward(step, seconds)
+        wheels = Motion(*carry(self.driven, self.driven_covariance, step, noise))
         result = self._match(scan, join(self.offset, step), search)
         if _is_good(result):
-            motion, covariance = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
-            agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
+            walls = self._motion_of(result)
+            agrees, *fused = fuse(wheels.pose, wheels.covariance, 1.0, walls.pose, walls.covariance)
             if agrees:
                 if search:  # what had to be searched for may be elsewhere
-                    fused_covariance = GATE * doubt
-                self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
+                    fused[1] = GATE * wheels.covariance
+                self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
                 return True
+        onward = self._onward(step, seconds)
         tried = [result] if self.velocity is None else [result, self._match(scan, join(self.offset, onward), search)]
-        good = [of for of in tried if _is_good(of) and self._is_possible(of, onward, seconds)]
+        good = [of for of in tried if _is_good(of)]
         if not good:
             return False
-        best = max(good, key=agreement)
-        return self._judge(k, scan, best, step, onward, driven, doubt, seconds)
+        possible = [of for of in good if self._is_possible(of, onward, seconds)]
+        best = max(possible or good, key=agreement)
+        self._judge(k, scan, best, bool(possible), wheels, step, onward, seconds)
+        return True
 
     def _judge(
         self,
         k: int,
         scan: Scan,
         result: ScanMatch,
+        possible: bool,
+        wheels: Motion,
         step: Array,
         onward: Array,
-        driven: Array,
-        doubt: Array,
         seconds: float,
-    ) -> bool:
+    ) -> None:
         """The wheels contradict a match, or led to none: who of the two is right?"""
-        motion, covariance = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
-        agrees, fused, fused_covariance = fuse(driven, doubt, GATE, motion, covariance)
-        if agrees:
-            self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
-            return True
-        missed = motion - driven
+        walls = self._motion_of(result)
+        missed = walls.pose - wheels.pose
         missed[2] = math.remainder(missed[2], 2 * math.pi)
-        deviations = math.sqrt(missed @ np.linalg.solve(GATE * doubt, missed))
-        by_wheels = driven + missed / max(deviations, 1.0)  # as near to the match as honest wheels may be
-        against = objection(self.scan, scan, result.motion, to_laser(self.mount, self.mount, by_wheels))
-        if against >= OBJECTS:
-            prior, prior_doubt = self._without_wheels(step, onward, seconds)
-            _, fused, fused_covariance = fuse(prior, prior_doubt, GATE, motion, covariance)
-            self.contradictions.append(Contradiction(k, True, missed))
+        honest = _honest_share(missed, wheels.covariance)
+        at_wheels = to_laser(self.mount, self.mount, wheels.pose + honest)
+        against = objection(self.scan, scan, result.motion, at_wheels) if possible else -1.0
+        within, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
+        if np.allclose(honest, missed) or (within and NEUTRAL <= against < OBJECTS):
+            self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
+        elif against < OBJECTS:
+            unsure = walls.covariance + OPEN * np.outer(missed, missed)
+            _, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, unsure)
+            self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
+        elif within:  # a slip that is not worth to be told
+            deviations = math.sqrt(missed @ np.linalg.solve(wheels.covariance, missed))
+            doubted = wheels.covariance * max(1.0, (deviations / HONEST) ** 2)
+            _, *fused = fuse(wheels.pose, doubted, GATE, walls.pose, walls.covariance)
+            self._arrive(k, Motion(*fused), Motion(wheels.pose, doubted), result.overlap, seconds)
+        else:
+            prior = self._without_wheels(step, onward, seconds)
+            _, *fused = fuse(prior.pose, prior.covariance, GATE, walls.pose, walls.covariance)
             # from here on the wheels count from where the walls put the vehicle
-            slipped = doubt + np.outer(missed, missed) + np.diag(np.square(SLIPPED))
-            self._arrive(k, fused, fused_covariance, fused, slipped, result.overlap, seconds)
-            return True
-        open_covariance = covariance + 1e2 * np.outer(missed, missed)
-        _, fused, fused_covariance = fuse(driven, doubt, GATE, motion, open_covariance)
-        self.contradictions.append(Contradiction(k, False, missed))
-        self._arrive(k, fused, fused_covariance, driven, doubt, result.overlap, seconds)
-        return True
+            slipped = wheels.covariance + np.outer(missed, missed) + np.diag(np.square(SLIPPED))
+            self._arrive(k, Motion(*fused), Motion(fused[0], slipped), result.overlap, seconds)
+        if not within:
+            self.contradictions.append(Contradiction(k, against >= OBJECTS, missed))
 
     def coast(self, k: int, step: Array, noise: Array, seconds: float) -> None:
         """Take odometry's word for scan `k`."""
-        offset, covariance = carry(self.offset, self.covariance, step, GATE * noise)
-        self._arrive(k, offset, covariance, *carry(self.driven, self.driven_covariance, step, noise), 0.0, seconds)
+        fused = Motion(*carry(self.offset, self.covariance, step, GATE * noise))
+        self._arrive(k, fused, Motion(*carry(self.driven, self.driven_covariance, step, noise)), 0.0, seconds)
 
     def _match(self, scan: Scan, guess: Array, search: bool) -> ScanMatch:
         at = to_laser(self.mount, self.mount, guess)
         if search:
             return search_match(self.scan, scan, at, SEARCH_M, SEARCH_RAD)
         return self.match(self.scan, scan, at)
+
+    def _motion_of(self, result: ScanMatch) -> Motion:
+        return Motion(*to_vehicle(self.mount, self.mount, result.motion, result.covariance))
 
     def _onward(self, step: Array, seconds: float) -> Array:
         """The next step of a vehicle that keeps its motion."""
@@ -159,29 +178,27 @@ class Chain:
         """Could the vehicle have got there from its motion so far?"""
         if self.velocity is None:
             return True
-        motion, _ = to_vehicle(self.mount, self.mount, result.motion, result.covariance)
-        moved = join(invert(join(self.offset, onward)), motion)
+        moved = join(invert(join(self.offset, onward)), self._motion_of(result).pose)
         far = SPEED_UP_M_S2 * seconds**2 + STEP_M + 3 * math.sqrt(self.covariance[0, 0] + self.covariance[1, 1])
         turned = TURN_UP_RAD_S2 * seconds**2 + STEP_RAD + 3 * math.sqrt(self.covariance[2, 2])
         return math.hypot(moved[0], moved[1]) < far and abs(moved[2]) < turned
 
-    def _without_wheels(self, step: Array, onward: Array, seconds: float) -> tuple[Array, Array]:
+    def _without_wheels(self, step: Array, onward: Array, seconds: float) -> Motion:
         """Where convicted wheels and the motion so far put the vehicle together, and with what doubt."""
         spread = np.diag(np.square(AWRY))
         if self.velocity is None:
-            return join(self.offset, step), self.covariance + spread
+            return Motion(join(self.offset, step), self.covariance + spread)
         change = np.array([STEADY_M_S2, 0.2 * STEADY_M_S2, STEADY_RAD_S2]) * seconds**2
         steady = np.diag(np.square(change + np.array([1e-3, 1e-3, 1e-3])))
         _, moved, doubt = fuse(onward, steady, GATE, step, spread)
-        return carry(self.offset, self.covariance, moved, doubt)
+        return Motion(*carry(self.offset, self.covariance, moved, doubt))
 
-    def _arrive(
-        self, k: int, offset: Array, covariance: Array, driven: Array, doubt: Array, overlap: float, seconds: float
-    ) -> None:
+    def _arrive(self, k: int, fused: Motion, wheels: Motion, overlap: float, seconds: float) -> None:
         if seconds > 0:
-            self.velocity = join(invert(self.offset), offset) / seconds
-        self.offset, self.covariance = offset, covariance
-        self.driven, self.driven_covariance = driven, doubt
+            self.velocity = join(invert(self.offset), fused.pose) / seconds
+        offset = self.offset = fused.pose
+        self.covariance = fused.covariance
+        self.driven, self.driven_covariance = wheels.pose, wheels.covariance
         self.reference[k], self.offsets[k], self.matched[k] = len(self.keyframes) - 1, offset, overlap > 0
         self.wants_keyframe = (
             np.hypot(offset[0], offset[1]) > KEYFRAME_SPACING_M
@@ -192,3 +209,14 @@ class Chain:
 
 def _is_good(result: ScanMatch) -> bool:
     return bool(result.converged and result.inliers >= MIN_INLIERS)
+
+
+def _honest_share(missed: Array, covariance: Array) -> Array:
+    """Of what the wheels missed (3,) as much as honest wheels may miss: what lies within HONEST along the axes of their
+    covariance (3, 3). The rest is what the two witnesses quarrel about.
+    """
+    lever = np.array([1.0, 1.0, LEVER_M])
+    values, axes = np.linalg.eigh(covariance * np.outer(lever, lever))
+    along = axes.T @ (missed * lever)
+    along[np.abs(along) > HONEST * np.sqrt(values)] = 0.0
+    return np.asarray(axes @ along / lever)

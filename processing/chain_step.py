@@ -56,3 +56,15 @@ def to_vehicle(first: Array, second: Array, motion: Array, covariance: Array) ->
         [[cm, -sm, s * second[0] + c * second[1]], [sm, cm, -c * second[0] + s * second[1]], [0.0, 0.0, 1.0]]
     )
     return moved, jacobian @ covariance @ jacobian.T
+
+
+@njit(cache=True)
+def add_up(steps: Array, noises: Array, ends: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Motions (n - 1, 3) and their covariances, of all steps (m, 3) from each of the `ends` (n,) to the next."""
+    count = len(ends) - 1
+    motions, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for k in range(count):
+        motions[k], covariances[k] = steps[ends[k]], noises[ends[k]]
+        for i in range(ends[k] + 1, ends[k + 1]):
+            motions[k], covariances[k] = carry(motions[k], covariances[k], steps[i], noises[i])
+    return motions, covariances

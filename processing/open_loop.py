@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from hw_profiles.profile import OdometryNoise
 from processing.chain import Chain, Contradiction
+from processing.chain_step import add_up
 from processing.geometry import accumulate, compose, interpolate_poses, relative
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
@@ -78,11 +79,17 @@ def mount_pose(run: Run) -> Array:
 
 
 def odometry_at_scans(run: Run) -> Motions:
-    """Motions (n - 1) between the scans: the wheels' angles, or /odom's poses, interpolated to the scans' times."""
+    """Motions (n - 1) between the scans: the wheels' angles, or /odom's poses, interpolated to the scans' times.
+
+    Where the scanner was silent while the wheels went on, all their samples count: a way round a corner is no arc.
+    """
     times = run.scans.times
     if run.wheels is not None:
-        first, second = (np.interp(times, run.motion_times, run.wheels[:, k]) for k in (0, 1))
-        return wheel_motions(run.profile, first, second)
+        between = (run.motion_times > times[0]) & (run.motion_times < times[-1])
+        every = np.union1d(times, run.motion_times[between])
+        first, second = (np.interp(every, run.motion_times, run.wheels[:, k]) for k in (0, 1))
+        steps = wheel_motions(run.profile, first, second)
+        return Motions(*add_up(steps.deltas, steps.covariances, np.searchsorted(every, times)))
     assert run.odometry is not None
     return odom_motions(interpolate_poses(run.motion_times, run.odometry, times), FOREIGN_NOISE)
 
