@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from processing.atlas import SCHEMA, Atlas
+from processing.convictions import convictions
 from processing.edge_placement import Placed, Placement
 from processing.graph import Graph
 from processing.trajectory import keyframe_poses, run_trajectory
@@ -24,6 +25,7 @@ def assemble_atlas(
     remarks: list[str],
     left_out: list[dict[str, Any]],
 ) -> Atlas:
+    """`remarks` and `left_out`: what the user should know, besides the witnesses that were convicted."""
     trajectories = {}
     for number, driven in enumerate(runs):
         poses = keyframe_poses(placement.pieces, number, len(driven.loop.keyframes))
@@ -44,6 +46,7 @@ def assemble_atlas(
         ],
         "nodes": [_node(k, runs, graph, placement) for k in range(len(graph.nodes))],
         "edges": [_edge(piece, runs, placement) for piece in placement.pieces],
+        "convictions": [of for driven in runs for of in convictions(driven)],
         "left_out": left_out,
         "remarks": remarks,
     }

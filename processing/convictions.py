@@ -1,0 +1,60 @@
+"""Convictions: the stretches of a run in which one witness was not believed, and by how much it was off.
+
+In: the scans at which wheels and walls contradicted each other. Out: what stands in atlas.json: run, ticks from and to,
+which witness, and how much. Contradictions close to each other are one stretch: a wheel that slips for a second.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.chain import Contradiction
+from processing.geometry import accumulate, relative
+
+if TYPE_CHECKING:
+    from processing.pipeline import DrivenRun
+
+Array = NDArray[np.float64]
+
+TOGETHER_S = 2.0  # a pause between contradictions that is shorter belongs to the stretch
+
+
+def convictions(driven: "DrivenRun") -> list[dict[str, Any]]:
+    """Those of a run, in order."""
+    times, ticks, poses = driven.run.scans.times, driven.run.scan_ticks, driven.loop.poses
+    out = []
+    for convicts_wheels in (True, False):
+        found = [of for of in driven.loop.contradictions if of.convicts_wheels == convicts_wheels]
+        cuts = [k for k, (a, b) in enumerate(pairwise(found), 1) if times[b.scan] - times[a.scan] > TOGETHER_S]
+        for first, last in pairwise([0, *cuts, len(found)]):
+            if first < last:
+                a, b = found[first].scan - 1, found[last - 1].scan
+                if convicts_wheels:
+                    wheels = accumulate(np.zeros(3), driven.loop.odometry.deltas[a:b])[-1]
+                    how_much = _tell_wheels(relative(wheels, relative(poses[a], poses[b])))
+                else:
+                    how_much = _tell_scans(found[first:last])
+                out.append(
+                    {
+                        "run": driven.run.run_id,
+                        "ticks": [int(ticks[a]), int(ticks[b])],
+                        "what": "wheels" if convicts_wheels else "scan",
+                        "how_much": f"{how_much} within {times[b] - times[a]:.1f} s",
+                    }
+                )
+    return sorted(out, key=lambda of: (of["ticks"], of["what"]))
+
+
+def _tell_wheels(off: Array) -> str:
+    """By how much the wheels would have led astray (3,) in all."""
+    return f"{np.hypot(off[0], off[1]):.2f} m and {abs(np.degrees(off[2])):.1f}° off the walls"
+
+
+def _tell_scans(stretch: Sequence[Contradiction]) -> str:
+    """What the worst was; the walls of these scans would have fitted elsewhere as well."""
+    missed = np.array([of.missed for of in stretch])
+    metres, degrees = np.hypot(missed[:, 0], missed[:, 1]).max(), np.degrees(np.abs(missed[:, 2]).max())
+    return f"{len(stretch)} scans up to {metres:.2f} m and {degrees:.1f}° off the wheels"
