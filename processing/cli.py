@@ -14,6 +14,10 @@ from pathlib import Path
 
 from hw_profiles.command import add_verb, run_verbs
 from hw_profiles.errors import BadInputError
+from processing.simulation.hazards import hazard_table
+
+HAZARDS = """hazards: each a [[hazards]] of the world's TOML with its kind, the `run` that it strikes (default: all),
+and more keys, with these defaults; what has none is drawn by lot, from the seed (a `for_s` without: the whole run):"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,8 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb.add_argument("world", metavar="WORLD.toml", help="a file, or the name of a shipped world")
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     verb.add_argument("--seed", type=int, help="default: the world's")
-    verb.add_argument("--noise-free", action="store_true", help="perfect sensors; walls and drives stay the same")
+    verb.add_argument(
+        "--noise-free", action="store_true", help="no hazards, perfect sensors; the same walls and drives"
+    )
     verb.add_argument("--run", action="append", metavar="NAME", help="only this run; may be repeated")
+    verb.epilog = "\n".join([HAZARDS, *hazard_table(), "", str(verb.epilog)])
 
     example = "rtlog-atlas import carmen intel.log.gz -o intel.mcap"
     verb = add_verb(verbs, "import", _import, "turn a log of another system into a recording", example)

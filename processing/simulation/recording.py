@@ -5,6 +5,7 @@ run's first tick; stamps are nanoseconds UTC.
 """
 
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import groupby
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from hw_profiles.profile import Profile
 from processing.simulation import sensors
 from processing.simulation.drive import Drive
+from processing.simulation.hazard_traffic import Obstacle
 from processing.simulation.raycast import SegmentGrid
 from processing.simulation.world import Noise, Scanner, Tag
 from rtlog_client.log_file import LogWriter
@@ -24,11 +26,12 @@ from rtlog_server import messages, topics
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 LATENESS_NS = (20_000, 200_000)  # of a tick, on an idle board
+STALE_S = 0.35  # a sensor that was silent for longer is told as such
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """What was sampled, one row a tick; times in seconds since the first tick."""
+    """What was sampled, one row a tick; times in seconds since the first tick, as they are stamped."""
 
     scanner: Scanner
     tick_s: Array  # (n,)
@@ -39,6 +42,7 @@ class Samples:
     round_s: Array  # (n,) last inventory round
     readings: list[sensors.TagReading]
     has_scan: NDArray[np.bool_]  # (n,)
+    has_joints: NDArray[np.bool_]  # (n,)
     is_recorded: NDArray[np.bool_]  # (n,)
 
 
@@ -51,8 +55,11 @@ def sample_drive(
     scanner: Scanner,
     noise: Noise,
     generators: dict[str, np.random.Generator],
+    obstacles: Sequence[Obstacle] = (),
+    scans_late_s: float = 0.0,
+    odometry_late_s: float = 0.0,
 ) -> Samples:
-    """Drive past the walls and tags (at `places`, (m, 2)), sampling every tick."""
+    """Drive past walls, obstacles, tags (at `places`, (m, 2)), sampling every tick; what comes late is stamped late."""
     clock = generators["clock"]
     tick_s = np.asarray(
         np.arange(int(drive.duration_s / profile.tick_period_s) + 1) * profile.tick_period_s, dtype=float
@@ -60,14 +67,18 @@ def sample_drive(
     sweep_s = sensors.sweep_times(tick_s, clock.uniform(0.0, sensors.SWEEP_PERIOD_S), scanner)
     latched_s = tick_s - sensors.ENCODER_LATENCY_S + clock.uniform(-1e-3, 1e-3, len(tick_s))
     mount = profile.lasers.primary.mount
-    ranges = sensors.simulate_sweeps(drive, grid, scanner, mount, sweep_s, noise.range_m, generators["laser"])
-    positions = sensors.simulate_encoders(drive, profile, latched_s, noise, generators["encoders"])
+    seen_s, counted_s = sweep_s - scans_late_s, latched_s - odometry_late_s
+    ranges = sensors.simulate_sweeps(drive, grid, scanner, mount, seen_s, noise.range_m, generators["laser"], obstacles)
+    positions = sensors.simulate_encoders(drive, profile, counted_s, noise, generators["encoders"])
     phase_s = clock.uniform(-sensors.ROUND_PERIOD_S, 0.0) - profile.tick_period_s
     missed = noise.missed_pass_probability
     round_s, readings = sensors.simulate_reads(drive, tags, places, tick_s, phase_s, missed, generators["rfid"])
     lost = generators["losses"].random((2, len(tick_s)))
     has_scan, is_recorded = lost[0] >= noise.dropped_scan_probability, lost[1] >= noise.dropped_tick_probability
-    return Samples(scanner, tick_s, sweep_s, ranges, latched_s, positions, round_s, readings, has_scan, is_recorded)
+    has_joints = np.ones(len(tick_s), dtype=bool)
+    return Samples(
+        scanner, tick_s, sweep_s, ranges, latched_s, positions, round_s, readings, has_scan, has_joints, is_recorded
+    )
 
 
 def stamps_of(start_ns: int, time_s: Array) -> Stamps:
@@ -88,6 +99,7 @@ def write_recording(
     latched_ns, round_ns = stamps_of(start_ns, samples.latched_s), stamps_of(start_ns, samples.round_s)
     lateness_ns = np.random.default_rng(boot_id.int).integers(*LATENESS_NS, len(tick_ns))
     newest_sweep_ns = np.maximum.accumulate(np.where(samples.has_scan, sweep_ns, sweep_ns[0]))
+    newest_latched_ns = np.maximum.accumulate(np.where(samples.has_joints, latched_ns, latched_ns[0]))
     reads = {tick: list(found) for tick, found in groupby(samples.readings, key=lambda reading: reading.tick)}
     names = [encoder.name for encoder in profile.encoders]
     scan_number = np.cumsum(samples.has_scan) - 1  # the server numbers what it sent, recorded or not
@@ -95,7 +107,11 @@ def write_recording(
         for k in np.flatnonzero(samples.is_recorded).tolist():
             now_ns, begun_ns = int(tick_ns[k]), int(tick_ns[k] + lateness_ns[k])
             sweep, latched = int(sweep_ns[k]), int(latched_ns[k])
-            newest = {"laser/primary": int(newest_sweep_ns[k]), "encoders": latched, "rfid": int(round_ns[k])}
+            newest = {
+                "laser/primary": int(newest_sweep_ns[k]),
+                "encoders": int(newest_latched_ns[k]),
+                "rfid": int(round_ns[k]),
+            }
             sent = [(topics.TICK, tick_message(k, now_ns, begun_ns, newest), begun_ns, k)]
             if samples.has_scan[k]:
                 sent.append(
@@ -106,7 +122,8 @@ def write_recording(
                         int(scan_number[k]),
                     )
                 )
-            sent.append((topics.JOINT_STATES, joint_message(latched, names, samples.positions[k]), latched, k))
+            if samples.has_joints[k]:
+                sent.append((topics.JOINT_STATES, joint_message(latched, names, samples.positions[k]), latched, k))
             sent.append((topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns, k))
             for topic, message, stamp_ns, sequence in sent:
                 log.write(topic.name, topic.msgtype, messages.encode(message), now_ns, stamp_ns, sequence)
@@ -114,8 +131,8 @@ def write_recording(
 
 def tick_message(index: int, scheduled_ns: int, begun_ns: int, newest_ns: dict[str, int]) -> object:
     states = [
-        messages.SensorState(name=name, state=messages.OK, age=(scheduled_ns - stamp_ns) * 1e-9)
-        for name, stamp_ns in newest_ns.items()
+        messages.SensorState(name=name, state=messages.STALE if age_s > STALE_S else messages.OK, age=age_s)
+        for name, age_s in ((name, (scheduled_ns - stamp_ns) * 1e-9) for name, stamp_ns in newest_ns.items())
     ]
     return messages.Tick(
         header=messages.header(begun_ns, ""),

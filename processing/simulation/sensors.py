@@ -7,6 +7,7 @@ In: the true drive, walls, tags, the noise. Out: arrays, one row a tick. Times a
     RFID     inventory rounds at 25 Hz; the paper's model (section 2.2): constant probability within the range, else 0
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from hw_profiles.profile import Encoder, Mount, Profile
 from processing.geometry import compose
 from processing.simulation.drive import Drive
+from processing.simulation.hazard_traffic import Obstacle
 from processing.simulation.raycast import SegmentGrid, cast
 from processing.simulation.world import Noise, Scanner, Tag
 
@@ -62,6 +64,7 @@ def simulate_sweeps(
     start_s: Array,
     range_noise_m: float,
     generator: np.random.Generator,
+    obstacles: Sequence[Obstacle] = (),
 ) -> NDArray[np.float32]:
     """Ranges (n, beams) in metres of sweeps that begin at `start_s` (n,), in whole millimetres; +inf beyond its range.
 
@@ -72,9 +75,13 @@ def simulate_sweeps(
     mounted = np.array([mount.x_m, mount.y_m, np.radians(mount.yaw_deg)])
     for first in range(0, len(start_s), CHUNK_SWEEPS):
         chunk = slice(first, first + CHUNK_SWEEPS)
-        laser = compose(drive.poses_at(start_s[chunk, None] + since_first_s), mounted)
+        time_s = start_s[chunk, None] + since_first_s
+        laser = compose(drive.poses_at(time_s), mounted)
         angles = laser[..., 2] + bearings
         distances = cast(grid, laser[..., :2].reshape(-1, 2), angles.ravel(), scanner.range_m).reshape(angles.shape)
+        for obstacle in obstacles:
+            beams = np.concatenate([laser[..., :2], angles[..., None]], axis=-1)
+            distances = np.minimum(distances, obstacle.distances(beams, time_s))
         distances += generator.normal(0.0, range_noise_m, distances.shape)
         millimetres = np.maximum(np.round(distances * 1000), 1.0)
         ranges[chunk] = np.where(distances <= scanner.range_m, millimetres / 1000, np.inf)

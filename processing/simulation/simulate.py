@@ -4,7 +4,7 @@ In: a world. Out: a folder, whole or not at all; for the same world and seed alw
 
     <world>-<run>.mcap   what rtlog-client would have recorded of the drive
     <world>-<run>.tum    the truth: t x y z qx qy qz qw of the vehicle in the world frame, at every stamp of the sensors
-    walls.csv            the true walls as segments x1,y1,x2,y2 in metres
+    walls.csv            the true walls as segments x1,y1,x2,y2 in metres, those that a later run found included
     tags.csv             epc,x,y
     world.toml           the world itself
 
@@ -14,10 +14,9 @@ Stamps are nanoseconds UTC, from a fixed day on; runs start four hours apart.
 import os
 import shutil
 import uuid
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +24,19 @@ import shapely
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
-from hw_profiles.profile import parse_profile, read_profile_text
+from hw_profiles.profile import Profile, parse_profile, read_profile_text
 from processing.simulation.drive import Drive, plan_drive
-from processing.simulation.raycast import build_grid
-from processing.simulation.recording import sample_drive, write_recording, write_truth
-from processing.simulation.walls import free_space, wall_segments
+from processing.simulation.hazard_clocks import delay_s
+from processing.simulation.hazard_samples import disturb
+from processing.simulation.hazard_tags import without_dead
+from processing.simulation.hazard_traffic import obstacles
+from processing.simulation.hazard_vehicle import true_profile
+from processing.simulation.hazard_walls import space_of
+from processing.simulation.hazards import OdometryLate, ScansLate
+from processing.simulation.lots import generator, strikes_of
+from processing.simulation.raycast import SegmentGrid, build_grid
+from processing.simulation.recording import Samples, sample_drive, write_recording, write_truth
+from processing.simulation.walls import free_space, new_walls, wall_segments
 from processing.simulation.world import Run, World, parse_world, read_world_text, without_noise
 
 Array = NDArray[np.float64]
@@ -61,7 +68,7 @@ def simulate(
         world_name: The world.
         out_dir: Where to; its parents are made.
         seed: In place of the world's; walls, driving and noise all follow it.
-        noise: False leaves out all that sensors get wrong, random or systematic; walls and drives stay the same.
+        noise: False leaves out hazards and all that sensors get wrong; walls and drives stay the same.
         runs: Only these; each comes out as it would among all.
         on_progress: Called with a run's name before it is simulated, the number of runs done, and of all.
 
@@ -82,22 +89,22 @@ def simulate(
     drives = [build_drive(world, run, seed, space) for _, run in chosen]
     segments = wall_segments(space)
     grid = build_grid(segments)
-    profile_toml = read_profile_text(world.profile)
-    profile = parse_profile(profile_toml, world.profile)
+    spaces = [space_of(run, world, space, seed) for _, run in chosen]
+    built = np.concatenate([segments, new_walls(spaces[-1], space)])
     results = []
     with _whole_folder(out_dir) as folder:
         (folder / "world.toml").write_text(text, encoding="utf-8")
-        np.savetxt(folder / "walls.csv", segments, "%.4f", ",", header="x1,y1,x2,y2", comments="")
+        np.savetxt(folder / "walls.csv", built, "%.4f", ",", header="x1,y1,x2,y2", comments="")
         rows = ["{},{:.4f},{:.4f}\n".format(tag.epc, *world.point(tag.at)) for tag in world.tags]
         (folder / "tags.csv").write_text("epc,x,y\n" + "".join(rows), encoding="ascii")
-        for done, ((index, run), drive) in enumerate(zip(chosen, drives, strict=True)):
+        for done, ((index, run), drive, found) in enumerate(zip(chosen, drives, spaces, strict=True)):
             if on_progress is not None:
                 on_progress(run.name, done, len(chosen))
             run_id, start_ns = f"{world.name}-{run.name}", FIRST_START_NS + index * BETWEEN_RUNS_NS
-            tags = [tag for tag in world.tags if run.name not in tag.unread_by]
-            places = np.array([world.point(tag.at) for tag in tags]).reshape(-1, 2)
-            generators = {stream: _generator(seed, run.name, stream) for stream in STREAMS}
-            samples = sample_drive(drive, grid, profile, tags, places, world.scanner, world.noise, generators)
+            profile_toml = read_profile_text(world.profile_of(run))
+            profile = parse_profile(profile_toml, world.profile_of(run))
+            walls = grid if found is space else build_grid(wall_segments(found))
+            samples = sample_run(world, run, drive, walls, profile, seed)
             boot_id = uuid.uuid5(uuid.NAMESPACE_OID, f"{run_id} {seed}")
             write_recording(folder / f"{run_id}.mcap", samples, profile, profile_toml, start_ns, boot_id)
             write_truth(folder / f"{run_id}.tum", drive, samples, start_ns)
@@ -106,14 +113,37 @@ def simulate(
     return results
 
 
+def sample_run(world: World, run: Run, drive: Drive, grid: SegmentGrid, profile: Profile, seed: int) -> Samples:
+    """What is sampled on a run, as its hazards leave it; `profile` is what the recording says of the vehicle."""
+    strikes = strikes_of(world, run, seed)
+    vehicle = true_profile(profile, strikes)
+    tags = [tag for tag in world.tags if run.name not in tag.unread_by]
+    places = np.array([world.point(tag.at) for tag in tags]).reshape(-1, 2)
+    samples = sample_drive(
+        drive,
+        grid,
+        vehicle,
+        tags,
+        places,
+        world.scanner,
+        world.noise,
+        {stream: generator(seed, run.name, stream) for stream in STREAMS},
+        obstacles(strikes, drive, vehicle.lasers.primary.mount),
+        scans_late_s=delay_s(strikes, ScansLate),
+        odometry_late_s=delay_s(strikes, OdometryLate),
+    )
+    samples = disturb(samples, strikes, drive, grid, vehicle, tags, places)
+    return replace(samples, readings=without_dead(samples.readings, world, run, drive.duration_s, seed))
+
+
 def build_space(world: World, seed: int) -> shapely.Geometry:
     """The free space of the world, its rough walls drawn from the seed."""
-    return free_space(world, _generator(seed, "walls"))
+    return free_space(world, generator(seed, "walls"))
 
 
 def build_drive(world: World, run: Run, seed: int, space: shapely.Geometry) -> Drive:
     """The true drive of a run. Raises: BadInputError: it comes too near to a wall, or cannot be driven."""
-    drive = plan_drive(world, run, _generator(seed, run.name, "driving"))
+    drive = plan_drive(world, run, generator(seed, run.name, "driving"))
     path = drive.pose[::10, :2]  # every 0.2 m
     clearances = clearance(path, space)
     worst = int(np.argmin(clearances))
@@ -131,11 +161,6 @@ def clearance(path: Array, space: shapely.Geometry) -> Array:
     walls = shapely.linestrings(wall_segments(space).reshape(-1, 2, 2))
     _, distances = shapely.STRtree(walls).query_nearest(points, return_distance=True, all_matches=False)
     return np.where(shapely.contains(space, points), distances, -distances)
-
-
-def _generator(seed: int, *names: str) -> np.random.Generator:
-    """One for each purpose, so that what one draws does not change what another does."""
-    return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
 @contextmanager

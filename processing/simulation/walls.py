@@ -71,6 +71,15 @@ def periodic_noise(count: int, step_m: float, correlation_m: float, generator: n
 
 def wall_segments(space: shapely.Geometry) -> Array:
     """The boundary of the free space as segments (n, 4): x1, y1, x2, y2, none longer than 2 m."""
-    rings = shapely.get_parts(shapely.boundary(shapely.segmentize(space, LONGEST_SEGMENT_M)))
-    corners = [shapely.get_coordinates(part) for part in rings]
-    return np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in corners])
+    return _segments(shapely.boundary(shapely.segmentize(space, LONGEST_SEGMENT_M)))
+
+
+def new_walls(later: shapely.Geometry, space: shapely.Geometry) -> Array:
+    """The walls of a later free space that were none of this one, as segments (n, 4)."""
+    found = shapely.difference(shapely.boundary(later), shapely.boundary(space))
+    return _segments(shapely.segmentize(found, LONGEST_SEGMENT_M))
+
+
+def _segments(lines: shapely.Geometry) -> Array:
+    corners = [shapely.get_coordinates(part) for part in shapely.get_parts(lines) if not part.is_empty]
+    return np.concatenate([np.zeros((0, 4)), *(np.hstack([ring[:-1], ring[1:]]) for ring in corners)])

@@ -10,6 +10,7 @@ In: a small TOML. Out: a `World`. Lengths in metres, coordinates as [x, y] in th
     [[runs]]                       drives from waypoint to waypoint; between two places of one drift the way follows it
     [scanner]                      beams, field of view and range of the laser, where it is no LMS111
     [noise]                        what the sensors get wrong; `profile` names what they are and how they are mounted
+    [[hazards]]                    what goes wrong now and then, or is not as the profile says: hazards.py
 """
 
 import math
@@ -24,6 +25,7 @@ from msgspec.structs import replace
 from hw_profiles.errors import BadInputError
 from hw_profiles.profile import Profile, load_profile
 from hw_profiles.strict_toml import Record, parse_toml
+from processing.simulation.hazards import AnyHazard
 
 SHIPPED = Path(__file__).parent.parent / "worlds"
 Place = str | tuple[float, float]
@@ -88,6 +90,7 @@ class Run(Record, frozen=True):
     waypoints: Annotated[list[Place], Meta(min_length=2)]
     speed_m_s: Annotated[float, Meta(ge=0.1, le=20.0)]
     stops_s: dict[str, Pause] = field(default_factory=dict)  # standing still at each passage of a place
+    profile: str | None = None  # of another vehicle than the world's
 
 
 class Scanner(Record, frozen=True):
@@ -131,9 +134,14 @@ class World(Record, frozen=True):
     scanner: Scanner = Scanner()
     driving: Driving = Driving()
     noise: Noise = Noise()
+    hazards: list[AnyHazard] = field(default_factory=list)
 
     def point(self, place: Place) -> tuple[float, float]:
         return self.places[place] if isinstance(place, str) else place
+
+    def profile_of(self, run: Run) -> str:
+        """The name or file of the profile of the vehicle that drives a run."""
+        return run.profile or self.profile
 
 
 def shipped_worlds() -> list[str]:
@@ -156,15 +164,15 @@ def read_world_text(name_or_path: str | Path) -> str:
 def parse_world(text: str, source: str) -> World:
     """Check a world's TOML; `source` names it in errors. Raises: BadInputError."""
     world = parse_toml(text, World, f"world {source}")
-    for problem in _problems(world, load_profile(world.profile)):
+    for problem in _problems(world):
         raise BadInputError(f"world {source}: {problem}")
     return world
 
 
 def without_noise(world: World) -> World:
-    """The same world, walls and drives with perfect sensors: what they count and round to stays."""
+    """The same world, walls and drives with perfect sensors and no hazards: what they count and round to stays."""
     tags = [replace(tag, read_probability=1.0) for tag in world.tags]
-    return replace(world, tags=tags, noise=Noise(range_m=0.0))
+    return replace(world, tags=tags, noise=Noise(range_m=0.0), hazards=[])
 
 
 def route(world: World, run: Run) -> list[tuple[Place, tuple[float, float]]]:
@@ -196,7 +204,7 @@ def _stretch(points: list[Place], start: Place, end: Place) -> list[Place] | Non
     return points[first + 1 : last] if first < last else points[last + 1 : first][::-1]
 
 
-def _problems(world: World, profile: Profile) -> Iterator[str]:
+def _problems(world: World) -> Iterator[str]:
     """What the types cannot say."""
     names = [run.name for run in world.runs]
     if len(set(names)) != len(names):
@@ -207,11 +215,26 @@ def _problems(world: World, profile: Profile) -> Iterator[str]:
     for tag in world.tags:
         if unknown := set(tag.unread_by) - {run.name for run in world.runs}:
             yield f"tag {tag.epc}: unread_by names no run: {', '.join(sorted(unknown))}"
-    roles = {encoder.role for encoder in profile.encoders}
-    if profile.vehicle is None or not roles:
-        yield f"profile {world.profile} has no vehicle with encoders"
-    if unknown := set(world.noise.wheel_radius_error_percent) - (roles - {"steering"}):
-        yield f"noise.wheel_radius_error_percent: profile {world.profile} has no wheel {', '.join(sorted(unknown))}"
+    wheels = {name: _wheels(load_profile(name)) for name in {world.profile_of(run): None for run in world.runs}}
+    for name in (name for name, found in wheels.items() if not found):
+        yield f"profile {name} has no vehicle with encoders"
+    if unknown := set(world.noise.wheel_radius_error_percent) - set().union(*wheels.values()):
+        profiles = ", ".join(f"profile {name}" for name in wheels)
+        yield f"noise.wheel_radius_error_percent: {profiles} has no wheel {', '.join(sorted(unknown))}"
+    for index, hazard in enumerate(world.hazards):
+        where = f"hazards[{index}] ({hazard.kind})"
+        if hazard.run is not None and hazard.run not in names:
+            yield f"{where}: there is no run {hazard.run}"
+        if (epc := getattr(hazard, "epc", None)) not in {None, *(tag.epc for tag in world.tags)}:
+            yield f"{where}: there is no tag {epc}"
+        wheel = getattr(hazard, "wheel", None)
+        for run in (run for run in world.runs if hazard.run in (None, run.name)):
+            if wheel is not None and wheel not in wheels[world.profile_of(run)]:
+                yield f"{where}: profile {world.profile_of(run)} of run {run.name} has no {wheel}"
+
+
+def _wheels(profile: Profile) -> set[str]:
+    return {encoder.role for encoder in profile.encoders if encoder.role != "steering"}
 
 
 def _named_places(world: World) -> Iterator[tuple[str, str]]:

@@ -15,7 +15,7 @@ from processing.simulation import simulate as simulate_module
 from processing.simulation.simulate import build_drive, build_space, clearance, simulate
 from processing.simulation.world import parse_world, read_world_text
 from rtlog_client.log_file import read_info, read_messages
-from rtlog_server.messages import decode, to_ns
+from rtlog_server.messages import OK, STALE, decode, to_ns
 
 Array = NDArray[np.float64]
 
@@ -196,6 +196,55 @@ def test_the_same_world_gives_the_same_bytes(world_path: Path, noisy: Path, tmp_
     simulate(world_path, tmp_path / "other", seed=4)
     other = digests(tmp_path / "other")
     assert all(other[name] != digests(noisy)[name] for name in ("small-there.mcap", "small-there.tum", "walls.csv"))
+
+
+HAZARDS = """
+[[hazards]]
+kind = "stuck"
+run = "there"
+[[hazards]]
+kind = "odometry_missing"
+run = "there"
+at_s = 4.0
+[[hazards]]
+kind = "wrong_mount"
+[[hazards]]
+kind = "changed_walls"
+"""
+
+
+def test_hazards_are_in_the_recordings_and_not_in_the_truth(world_path: Path, noisy: Path, tmp_path: Path) -> None:
+    struck = tmp_path / "struck.toml"
+    struck.write_text(WORLD + HAZARDS)
+    for folder in ("out", "again"):
+        simulate(struck, tmp_path / folder)
+    assert digests(tmp_path / "out") == digests(tmp_path / "again")
+    for run in ("there", "back"):
+        name = f"small-{run}"
+        assert (tmp_path / "out" / f"{name}.tum").read_bytes() == (noisy / f"{name}.tum").read_bytes()
+        profiles = [read_info(folder / f"{name}.mcap").profile_toml for folder in (tmp_path / "out", noisy)]
+        assert profiles[0] == profiles[1]
+    gone = dict.fromkeys(("there", "back"), 0)
+    for run in gone:
+        counts = [read_info(f / f"small-{run}.mcap").message_counts for f in (noisy, tmp_path / "out")]
+        gone[run] = counts[0]["/encoders/joint_states"] - counts[1]["/encoders/joint_states"]
+    assert 25 <= gone["there"] <= 30
+    assert gone["back"] == 0
+    ticks = decoded(tmp_path / "out" / "small-there.mcap", "/rtlog/tick")
+    states = {tick.index: {each.name: each.state for each in tick.sensors}["encoders"] for tick in ticks}
+    assert {state for k, state in states.items() if k < 40} == {OK}
+    assert {state for k, state in states.items() if 45 <= k <= 70} == {STALE}
+    assert len((tmp_path / "out" / "walls.csv").read_text()) > len((noisy / "walls.csv").read_text())
+
+
+def test_each_run_may_have_a_vehicle_of_its_own(world_path: Path, tmp_path: Path) -> None:
+    both = tmp_path / "both.toml"
+    both.write_text(WORLD.replace('name = "back"', 'name = "back"\nprofile = "cu_ss534"'))
+    simulate(both, tmp_path / "out")
+    names = {run: read_info(tmp_path / "out" / f"small-{run}.mcap").metadata["profile"] for run in ("there", "back")}
+    assert names == {"there": "canmet_trailer", "back": "cu_ss534"}
+    joints = decoded(tmp_path / "out" / "small-back.mcap", "/encoders/joint_states")
+    assert joints[0].name == ["drive_wheel", "steering"]
 
 
 def test_an_existing_output_is_left_alone(world_path: Path, tmp_path: Path) -> None:

@@ -37,6 +37,9 @@ def test_a_world_has_its_drifts_tags_and_runs() -> None:
     assert world.point("c") == (30.0, 20.0)
 
 
+HAZARD = 'schema = 1\nhazards = [{ kind = "slip", KEY }]'
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -55,6 +58,26 @@ def test_a_world_has_its_drifts_tags_and_runs() -> None:
             "has no wheel drive_wheel",
         ),
         ("schema = 1", "schema = ", "not TOML"),
+        (
+            "schema = 1",
+            'schema = 1\nhazards = [{ kind = "slid", times = 2 }]',
+            r"unknown kind 'slid' at `hazards\[0\].kind`; the nearest known one is slide",
+        ),
+        ("schema = 1", HAZARD.replace("KEY", "facter = 0.5"), r"unknown key hazards\[0\].facter; .* is factor"),
+        ("schema = 1", HAZARD.replace("KEY", "factor = 0.0"), r"`float` >= 0.1 at `hazards\[0\].factor`"),
+        ("schema = 1", HAZARD.replace("KEY", "at_s = nan"), r"hazards\[0\].at_s is no finite number"),
+        ("schema = 1", HAZARD.replace("KEY", 'run = "s"'), r"hazards\[0\] \(slip\): there is no run s"),
+        (
+            "schema = 1",
+            HAZARD.replace("KEY", 'wheel = "drive_wheel"'),
+            r"hazards\[0\] \(slip\): profile canmet_trailer of run r has no drive_wheel",
+        ),
+        (
+            "schema = 1",
+            'schema = 1\nhazards = [{ kind = "dead_tag", epc = "E20034120000000000000002" }]',
+            r"hazards\[0\] \(dead_tag\): there is no tag E20034120000000000000002",
+        ),
+        ("speed_m_s = 2.0", 'speed_m_s = 2.0\nprofile = "cu_ss53"', "profile cu_ss53: "),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(old: str, new: str, message: str) -> None:
@@ -99,6 +122,8 @@ def test_without_noise_only_the_sensors_change() -> None:
     quiet = without_noise(world)
     assert quiet.noise.range_m == quiet.noise.slip_m_per_sqrt_m == quiet.noise.missed_pass_probability == 0.0
     assert not quiet.noise.wheel_radius_error_percent
+    slipping = parse_world(WORLD.replace("schema = 1", HAZARD.replace("KEY", "times = 2")), "w.toml")
+    assert (len(slipping.hazards), without_noise(slipping).hazards) == (1, [])
     assert (quiet.runs, quiet.drifts, quiet.walls) == (world.runs, world.drifts, world.walls)
 
 
