@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.scan_matching import nearest_wall
-from processing.scan_walls import BEARING_RAD, FUSED, RANGE_NOISE_M, Scan, bearing
+from processing.scan_walls import BEARING_RAD, FUSED, Scan, bearing
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,6 +39,7 @@ def _misfits(
     bent: float,
     points: Array,
     normals: Array,
+    range_noise_m: float,
     poses: Array,  # (2, 3)
     sums: Array,  # (2, SECTORS)
     counts: Ints,  # (SECTORS,)
@@ -67,7 +68,7 @@ def _misfits(
                 error = ref_normals[best, 0] * (x - ref_points[best, 0]) + ref_normals[best, 1] * (
                     y - ref_points[best, 1]
                 )
-                variance = ref_variances[best, 0] + RANGE_NOISE_M * RANGE_NOISE_M
+                variance = ref_variances[best, 0] + range_noise_m * range_noise_m
                 costs[p] = min(error * error / (MISFIT * variance), 1.0)
             elif p == 1 or (middle < beams and distance < math.hypot(ref_points[middle, 0], ref_points[middle, 1])):
                 costs[p] = 1.0  # also where it would lie out of sight: what is seen speaks for where it is
@@ -94,6 +95,7 @@ def objection(reference: Scan, current: Scan, matched: Array, wheels: Array) -> 
         reference.bent_rad,
         current.points,
         current.normals,
+        current.range_noise_m,
         np.stack([matched, wheels]),
         sums,
         counts,

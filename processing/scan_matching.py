@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.scan_match import ScanMatch
-from processing.scan_walls import BEARING_RAD, FUSED, RANGE_NOISE_M, Scan, bearing
+from processing.scan_walls import BEARING_RAD, FUSED, Scan, bearing
 
 Array = NDArray[np.float64]
 
@@ -111,6 +111,7 @@ def _gauss_newton(
     bent: float,
     points: Array,
     normals: Array,
+    range_noise_m: float,
     guess: Array,
     reach_m: float,
     max_iterations: int,
@@ -152,17 +153,14 @@ def _gauss_newton(
                 seen_at += 2 * math.pi
             middle = int(seen_at / increment + 0.5)
             best = nearest_wall(ref_points, ref_normals, increment, bent, middle, (x, y, nx, ny, distance), reach)
-            if best < 0:  # gone, or never in the reference's sight: beside its field of view, or behind its walls?
-                if (
-                    middle < beams
-                    and not distance > math.hypot(ref_points[middle, 0], ref_points[middle, 1]) + CLOSEST_M
-                ):
+            if best < 0:  # gone, or never in the reference's sight: without a beam, a return, or behind walls?
+                if middle < beams and distance <= math.hypot(ref_points[middle, 0], ref_points[middle, 1]) + CLOSEST_M:
                     visible += 1
                 continue
             visible += 1
             mx, my = ref_normals[best, 0], ref_normals[best, 1]
             error = mx * (x - ref_points[best, 0]) + my * (y - ref_points[best, 1])
-            variance = ref_variances[best, 0] + RANGE_NOISE_M * RANGE_NOISE_M
+            variance = ref_variances[best, 0] + range_noise_m * range_noise_m
             corner = 9.0 * variance + ((reach - CLOSEST_M) / 3.0) ** 2  # wide at first: a poor guess is no outlier
             weight = 1.0 / (variance * (1.0 + error * error / corner) ** 2)  # Geman-McClure
             matched += 1
@@ -229,6 +227,7 @@ def approach(reference: Scan, current: Scan, guess: Array, reach_m: float, itera
         reference.bent_rad,
         current.points,
         current.normals,
+        current.range_noise_m,
         np.asarray(guess, dtype=np.float64),
         reach_m,
         iterations,

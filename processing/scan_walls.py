@@ -2,7 +2,8 @@
 
 In: points in the scanner's frame, by ascending bearing. Out: a `Scan`: at each point the normal of the wall, and how
 sure point and normal are. A rough wall is known from the few points around; a smooth one from two metres of it, so that
-its direction is known to a milliradian: how else would a match know along which way it sees nothing?
+its direction is known to a milliradian: how else would a match know along which way it sees nothing? A wall goes on
+across beams that have no return, as on dark wet rock, or met dust.
 """
 
 import math
@@ -11,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from processing.solid_returns import solid_returns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,6 +24,9 @@ MAX_NEIGHBOURS = 12
 SMOOTH_M = 2.0  # a wall this far straight, to as much as noise lets one see, is smooth
 CHANCE = 2.0  # standard deviations by which its residuals may exceed the noise
 GRAZING = 6.0  # neighbouring points further apart than this many times r·Δφ see no wall, or see it at less than 10°
+NEAR_M = 0.15  # nearer than this they see one wall in any case
+MAX_GAP = 16  # beams from one return to the next, where all in between say nothing; and
+MAX_GAP_M = 1.0  # metres, lest the ends of two walls far down a drift be joined across it
 BEARING_RAD = 2.5e-4  # how far off `bearing` may be
 AT_ORIGIN = np.zeros(3)
 FUSED = {"contract", "nsz", "arcp"}  # what compilers may do to sums and quotients; NaN stays NaN
@@ -37,6 +43,7 @@ class Scan:
     angle_increment: float
     bent_rad: float  # how far off its beam's bearing a point lies at most: the motion during the sweep was removed
     mount: Array  # (3,) where the scanner sits in its vehicle: runs of one mine have different ones
+    range_noise_m: float = RANGE_NOISE_M
 
 
 @njit(cache=True, error_model="numpy", fastmath=FUSED)
@@ -56,7 +63,7 @@ def bearing(x: float, y: float) -> float:
 
 @njit(cache=True)
 def _stretches(points: Array, joined: NDArray[np.bool_]) -> tuple[Array, Ints, Ints]:
-    """Sums (B + 1, 5) of x, y, x², xy, y² over all points before each; and for each point the first and the last (B, 2)
+    """Sums (K + 1, 5) of x, y, x², xy, y² over all points before each; and for each point the first and the last (K, 2)
     of those in a row with it, and of those in a row that lie within SMOOTH_M.
     """
     count = points.shape[0]
@@ -64,14 +71,11 @@ def _stretches(points: Array, joined: NDArray[np.bool_]) -> tuple[Array, Ints, I
     first = last = 0
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        known = math.isfinite(x)
-        sums[i + 1] = sums[i]
-        if known:
-            sums[i + 1, 0] += x
-            sums[i + 1, 1] += y
-            sums[i + 1, 2] += x * x
-            sums[i + 1, 3] += x * y
-            sums[i + 1, 4] += y * y
+        sums[i + 1, 0] = sums[i, 0] + x
+        sums[i + 1, 1] = sums[i, 1] + y
+        sums[i + 1, 2] = sums[i, 2] + x * x
+        sums[i + 1, 3] = sums[i, 3] + x * y
+        sums[i + 1, 4] = sums[i, 4] + y * y
         if i > 0 and not joined[i - 1]:
             first = i
         rows[i, 0] = rows[i - 1, 0] if i > 0 and joined[i - 1] else i
@@ -96,25 +100,38 @@ def _scatter(sums: Array, first: int, last: int) -> tuple[float, float, float]:
 
 
 @njit(cache=True, error_model="numpy", fastmath=FUSED)
-def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array, variances: Array) -> float:
+def _join(points: Array, beams: Ints, increment: float) -> NDArray[np.bool_]:
+    """Do a point (K, 2) of these beams and the next lie on one wall? (K,)"""
+    joined = np.zeros(len(beams), np.bool_)
+    for i in range(len(beams) - 1):
+        gap = beams[i + 1] - beams[i]
+        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        furthest = GRAZING * increment * math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+        furthest = max(NEAR_M, furthest, min(gap * furthest, MAX_GAP_M))
+        joined[i] = gap <= MAX_GAP and math.sqrt(dx * dx + dy * dy) < furthest
+    return joined
+
+
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
+def _fit_walls(
+    all_points: Array, angle_min: float, increment: float, range_noise_m: float, normals: Array, variances: Array
+) -> float:
     """A line through each point and as many neighbours as span WALL_LENGTH_M: its normal, and how sure both are.
 
     Returns: how far off its beam's bearing a point lies at most [rad].
     """
-    count, bent = points.shape[0], 0.0
+    normals[:] = np.nan
+    variances[:] = np.nan
+    beams = solid_returns(all_points, range_noise_m)
+    count, least_variance, bent = len(beams), range_noise_m * range_noise_m, 0.0
+    points = np.empty((count, 2))
     for i in range(count):
-        if math.isfinite(points[i, 0]):
-            off = bearing(points[i, 0], points[i, 1]) - (angle_min + i * increment)
-            bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
-    joined = np.zeros(count, np.bool_)  # with the next beam: do the two see one wall?
-    for i in range(count - 1):
-        dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
-        reach = math.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
-        joined[i] = math.sqrt(dx * dx + dy * dy) < max(0.15, GRAZING * increment * reach)  # NaN compares false
+        points[i, 0], points[i, 1] = all_points[beams[i], 0], all_points[beams[i], 1]
+        off = bearing(points[i, 0], points[i, 1]) - (angle_min + beams[i] * increment)
+        bent = max(bent, abs(off - 2 * math.pi * round(off / (2 * math.pi))))
+    joined = _join(points, beams, increment)
     sums, rows, ends = _stretches(points, joined)
     for i in range(count):
-        normals[i, 0] = normals[i, 1] = np.nan
-        variances[i, 0] = variances[i, 1] = np.nan
         if i == 0 or i == count - 1 or not (joined[i - 1] and joined[i]):
             continue
         # Grow to both sides, a beam at a time.
@@ -137,7 +154,7 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
             if m > n and dx * dx + dy * dy > SMOOTH_M * SMOOTH_M:
                 txx, txy, tyy = _scatter(sums, a, b)
                 rest = 0.5 * (txx + tyy) - math.sqrt(0.25 * (txx - tyy) ** 2 + txy * txy)
-                if rest < RANGE_NOISE_M**2 * (m - 2 + CHANCE * math.sqrt(2.0 * (m - 2))):
+                if rest < least_variance * (m - 2 + CHANCE * math.sqrt(2.0 * (m - 2))):
                     n, sxx, sxy, syy = m, txx, txy, tyy
                     break
         # The larger eigenvalue of the scatter, and its direction: the wall's.
@@ -152,16 +169,22 @@ def _fit_walls(points: Array, angle_min: float, increment: float, normals: Array
         nx, ny = -wy / length, wx / length
         if nx * points[i, 0] + ny * points[i, 1] > 0:
             nx, ny = -nx, -ny
-        noise = max(across / (n - 2), RANGE_NOISE_M * RANGE_NOISE_M)
-        normals[i, 0], normals[i, 1] = nx, ny
-        variances[i, 0] = noise
-        variances[i, 1] = noise / along
+        noise = max(across / (n - 2), least_variance)
+        normals[beams[i], 0], normals[beams[i], 1] = nx, ny
+        variances[beams[i], 0] = noise
+        variances[beams[i], 1] = noise / along
     return bent + BEARING_RAD
 
 
-def prepare_scan(points: Array, angle_min: float, angle_increment: float, mount: Array = AT_ORIGIN) -> Scan:
+def prepare_scan(
+    points: Array,
+    angle_min: float,
+    angle_increment: float,
+    mount: Array = AT_ORIGIN,
+    range_noise_m: float = RANGE_NOISE_M,
+) -> Scan:
     """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     normals, variances = np.empty_like(points), np.empty_like(points)
-    bent_rad = _fit_walls(points, angle_min, angle_increment, normals, variances)
-    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad, mount)
+    bent_rad = _fit_walls(points, angle_min, angle_increment, range_noise_m, normals, variances)
+    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad, mount, range_noise_m)
