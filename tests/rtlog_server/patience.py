@@ -41,6 +41,11 @@ class Told:
         return False
 
 
+def left_behind(before: tuple[int, int]) -> bool:
+    """Whether more descriptors or threads are in use than before."""
+    return any(now > then for now, then in zip(in_use(), before, strict=True))
+
+
 def in_use() -> tuple[int, int]:
     """Descriptors and threads of this process."""
     return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
