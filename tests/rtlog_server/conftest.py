@@ -226,6 +226,11 @@ class EncoderHost:
         self.wait_for(lambda: len(self.readings) >= first + number)
         return self.readings[first:]
 
+    def assert_one_a_tick(self) -> None:
+        """At most: a round that comes late delays none of the others, and none is asked twice for a tick."""
+        ticks = (self.readings[-1].complete_ns - self.grid.start_ns) // self.grid.period_ns + 2
+        assert len(self.readings) <= ticks
+
     def wait_for_message(self, part: str) -> None:
         """It may be over by then."""
         self.wait_for(lambda: self.told(part))
