@@ -9,7 +9,7 @@ NAME.atlas/map.pgm, .yaml, .png      the stitched picture: a view of the atlas, 
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -89,15 +89,6 @@ def read_document(path: Path) -> dict[str, Any]:
         raise BadInputError(f"{path}/atlas.json: schema is not {SCHEMA}; another version of rtlog-atlas wrote it")
     check_document(document, f"{path}/atlas.json")
     return document
-
-
-def caveats(document: Mapping[str, Any]) -> list[str]:
-    """What the user should know about the map, a line each: what was left out and why, and other remarks."""
-    out = []
-    for item in document.get("left_out", []):
-        ticks = ", ".join(map(str, item["ticks"]))
-        out.append(f"{item['what']} is left out of run {item['run']}, ticks {ticks}: {item['reason']}")
-    return [*out, *document["remarks"]]
 
 
 def _overlay(atlas: Atlas) -> Overlay:

@@ -41,6 +41,8 @@ def assemble_atlas(
                 "ticks": d.run.ticks,
                 "profile": d.run.profile.name,
                 "wheel_scale": _metres(d.wheels.scale),  # true over counted distance, as the laser saw it
+                "scans": len(d.loop.matched),
+                "scans_unused": int((~d.loop.matched[1:]).sum()),  # those that odometry alone carries
             }
             for d in runs
         ],

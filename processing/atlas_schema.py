@@ -16,6 +16,8 @@ class _Run(Struct):
     sha256: str
     ticks: int
     profile: str
+    scans: int = 0
+    scans_unused: int = 0
 
 
 class _Pass(Struct):
@@ -65,6 +67,13 @@ class _LeftOut(Struct):
     reason: str
 
 
+class _Conviction(Struct):
+    run: str
+    ticks: tuple[int, int]
+    what: Literal["wheels", "scan", "tag", "profile"]
+    how_much: str
+
+
 class _Document(Struct):
     schema: int
     runs: list[_Run]
@@ -72,6 +81,7 @@ class _Document(Struct):
     edges: list[_Edge]
     remarks: list[str]
     left_out: list[_LeftOut] = []
+    convictions: list[_Conviction] = []
 
 
 def check_document(document: Any, source: str) -> None:

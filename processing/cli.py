@@ -19,6 +19,8 @@ from processing.simulation.hazards import hazard_table
 HAZARDS = """hazards: each a [[hazards]] of the world's TOML with its kind, the `run` that it strikes (default: all),
 and more keys, with these defaults; what has none is drawn by lot, from the seed (a `for_s` without: the whole run):"""
 
+MOST_LINES = 20  # of one kind that `build` prints
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="rtlog-atlas", description="Makes maps of recordings.")
@@ -106,10 +108,10 @@ def _build(args: argparse.Namespace) -> None:
     config = Config(args.method, args.assembly, args.matcher)
     atlas = build(args.recordings, profile, config, args.output, args.jobs)
     document = atlas.document
-    from processing.atlas import caveats
+    from processing.caveats import caveats, rests_on_little
 
-    for line in caveats(document):
-        print(f"rtlog-atlas: {line}", file=sys.stderr)
+    told, weak = caveats(document), rests_on_little(document)
+    _tell(told, args.output)
     summary = {
         "atlas": str(args.output),
         "runs": len(document["runs"]),
@@ -117,16 +119,33 @@ def _build(args: argparse.Namespace) -> None:
         "edges": sum(edge["kind"] == "edge" for edge in document["edges"]),
         "parts": 1 + max(edge["part"] for edge in document["edges"]),
         "seconds": round(time.monotonic() - began, 1),
+        **{kind: len(lines) for kind, lines in told.items()},
+        "rests_on_little": weak,
     }
     if args.json:
         print(json.dumps(summary))
     else:
         counts = "{runs} runs, {nodes} beacons, {edges} edges, {parts} connected part(s)".format(**summary)
-        print(f"{args.output}: {counts} in {summary['seconds']} s; look at {args.output / 'map.png'}")
+        things = sum(map(len, told.values()))
+        known = f", with {things} thing{'s' * (things > 1)} to know above" if things else ""
+        little = f"; it rests on little: {', '.join(weak)}" if weak else ""
+        print(f"{args.output}: {counts} in {summary['seconds']} s; look at {args.output / 'map.png'}{known}{little}")
+
+
+def _tell(told: dict[str, list[str]], atlas: Path) -> None:
+    for kind, lines in told.items():
+        for line in lines[:MOST_LINES]:
+            print(f"rtlog-atlas: {line}", file=sys.stderr)
+        if more := lines[MOST_LINES:]:
+            print(
+                f"rtlog-atlas: {len(more)} more {kind.replace('_', ' ')}; rtlog-atlas info {atlas} shows all",
+                file=sys.stderr,
+            )
 
 
 def _info(args: argparse.Namespace) -> None:
-    from processing.atlas import caveats, read_document
+    from processing.atlas import read_document
+    from processing.caveats import caveats, rests_on_little
 
     document = read_document(args.atlas)
     if args.json:
@@ -144,8 +163,11 @@ def _info(args: argparse.Namespace) -> None:
         print(
             f"{edge['kind']:5} {edge['id']}: {len(edge['paths'])} paths{length}, {edge['links']['strong']} strong links"
         )
-    for line in caveats(document):
-        print(f"note  {line}")
+    for lines in caveats(document).values():
+        for line in lines:
+            print(f"note  {line}")
+    if weak := rests_on_little(document):
+        print(f"note  the map rests on little: {', '.join(weak)}")
 
 
 def _report(args: argparse.Namespace) -> None:

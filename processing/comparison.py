@@ -19,12 +19,15 @@ from processing.evaluation import (
     Trajectory,
     absolute_error,
     align_parts,
+    align_whole,
     beacon_errors,
     distribution,
     edge_length_errors,
+    largest_part_share,
     match_truth,
     relative_error,
     true_place,
+    way_driven,
 )
 from processing.geometry import Array, transform
 from processing.map_files import read_map
@@ -38,6 +41,9 @@ RELATIVE_DISTANCES_M = (10.0, 100.0)
 def compare_truth(atlas: Path, truth: Path) -> dict[str, Any]:
     """The atlas against the truth of its runs; what the truth's folder does not hold is None.
 
+    The trajectories are moved as one rigid body (`ate`, `ate_of_runs`), and each part for itself (`ate_each_part`), as
+    are beacons and walls.
+
     Raises:
         BadInputError: a file is malformed, or no run of the atlas has a truth of the same time.
     """
@@ -48,7 +54,10 @@ def compare_truth(atlas: Path, truth: Path) -> dict[str, Any]:
     if not runs:
         raise BadInputError(f"{truth}: holds no truth of {', '.join(trajectories)} at the time of the recordings")
     parts = {path["run"]: edge["part"] for edge in document["edges"] for path in edge["paths"]}
-    moves = align_parts(runs, parts)
+    whole, moves = align_whole(runs, parts), align_parts(runs, parts)
+    ways_m = {
+        run_id: way_driven(runs[run_id].truth if run_id in runs else of.poses) for run_id, of in trajectories.items()
+    }
     beacons = [
         Beacon(n["epc"], np.array([n["x"], n["y"]]), n["part"], [p["run"] for p in n["passes"]])
         for n in document["nodes"]
@@ -62,10 +71,12 @@ def compare_truth(atlas: Path, truth: Path) -> dict[str, Any]:
     stated = {run_id: (true[run_id].stamps_ns, true[run_id].poses) for run_id in runs}
     relatives = [relative_error(runs, distance_m) for distance_m in RELATIVE_DISTANCES_M]
     figures: dict[str, Any] = {
-        "parts": len(moves),
+        "parts": len(set(parts.values())),
+        "largest_part_share": largest_part_share(ways_m, parts),
         "runs_without_truth": sorted(set(trajectories) - set(runs)),
-        "ate": asdict(absolute_error(runs, parts, moves)),
-        "ate_of_runs": {run_id: asdict(absolute_error({run_id: runs[run_id]}, parts, moves)) for run_id in runs},
+        "ate": asdict(absolute_error(runs, parts, whole)),
+        "ate_of_runs": {run_id: asdict(absolute_error({run_id: runs[run_id]}, parts, whole)) for run_id in runs},
+        "ate_each_part": asdict(absolute_error(runs, parts, moves)),
         "rpe": [asdict(error) for error in relatives if error is not None],
         "beacon_error_m": _plain(distribution(np.array([error.error_m for error in at_beacons]))),
         "beacons": [asdict(error) for error in at_beacons],
@@ -98,10 +109,16 @@ def table(figures: dict[str, Any]) -> str:
     """The figures as lines for people."""
     lines = []
     if truth := figures.get("truth"):
-        ate, rows = truth["ate"], []
+        ate, several, rows = truth["ate"], truth["parts"] > 1, []
+        share = f"{truth['parts']}; the largest holds {100 * truth['largest_part_share']:.1f} % of the way driven"
+        rows.append(("connected parts", share))
         rows.append(("absolute trajectory error", f"{ate['rmse_m']:.4f} m rmse, {ate['max_m']:.4f} m at most"))
         rows += [(f"  {run}", f"{error['rmse_m']:.4f} m") for run, error in truth["ate_of_runs"].items()]
         rows.append(("  heading", f"{ate['heading_rmse_deg']:.3f}° rmse"))
+        if several:
+            each = truth["ate_each_part"]
+            figure = f"{each['rmse_m']:.4f} m rmse, {each['max_m']:.4f} m at most: not where the parts lie"
+            rows.append(("  each part for itself", figure))
         for error in truth["rpe"]:
             figure = f"{error['translation_rmse_m']:.4f} m, {error['rotation_rmse_deg']:.3f}° rmse"
             rows.append((f"relative error over {error['distance_m']:g} m", figure))
@@ -119,8 +136,8 @@ def table(figures: dict[str, Any]) -> str:
             rows.append(("wall cells: precision", f"{walls['precision']:.4f} of {walls['occupied_cells']} drawn"))
             rows.append(("wall cells: recall", f"{walls['recall']:.4f} of {walls['seen_cells']} seen"))
         rows.append(("poses compared", f"{ate['stamps']}, and {ate['uncounted']} outside the truth's time"))
-        if truth["parts"] > 1:
-            rows.append(("unconnected parts", f"{truth['parts']}, each aligned for itself"))
+        if several:
+            rows.append(("beacons and walls", "each part aligned for itself"))
         rows += [("no truth of run", run_id) for run_id in truth["runs_without_truth"]]
         lines += [f"{name:28} {value}" for name, value in rows]
     if relations := figures.get("relations"):

@@ -1,7 +1,8 @@
 """How near an atlas is to the truth: trajectories, beacons, edge lengths.
 
 In: trajectories and the truth of the same runs, places of beacons. Out: errors in metres and degrees. Law: the atlas is
-moved as one rigid body, each of its unconnected parts for itself, and never bent or scaled, before it is compared.
+moved as one rigid body, and never bent or scaled, before it is compared. Its unconnected parts may also be moved each
+for itself: that says how good each of them is, and hides that they do not lie as they should to each other.
 Sources: absolute trajectory error and relative pose error after Sturm et al. 2012, with Umeyama 1991's alignment.
 
 The truth is interpolated at the estimate's stamps; stamps outside the truth's time are not counted, and that is told.
@@ -99,6 +100,23 @@ def align_parts(runs: Mapping[str, Matched], parts: Mapping[str, int]) -> dict[i
         truth = np.concatenate([matched.truth for matched in members])
         found[part] = align(estimate[:, :2], truth[:, :2])
     return found
+
+
+def align_whole(runs: Mapping[str, Matched], parts: Mapping[str, int]) -> dict[int, Array]:
+    """The same for all parts as one rigid body: each part gets the one pose (3,)."""
+    whole = align_parts(runs, dict.fromkeys(runs, 0))[0]
+    return dict.fromkeys(sorted({parts[run_id] for run_id in runs}), whole)
+
+
+def largest_part_share(ways_m: Mapping[str, float], parts: Mapping[str, int]) -> float:
+    """What share of the way driven, by run, lies in the part that holds most of it."""
+    held = [sum(ways_m[run_id] for run_id in ways_m if parts.get(run_id) == part) for part in set(parts.values())]
+    return max(held) / sum(held) if sum(held) > 0 else 1.0
+
+
+def way_driven(poses: Array) -> float:
+    """Length [m] of a drive through poses (n, 3)."""
+    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
 def absolute_error(runs: Mapping[str, Matched], parts: Mapping[str, int], moves: Mapping[int, Array]) -> AbsoluteError:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError, RTLogError
-from processing.atlas import caveats, read_document
+from processing.atlas import read_document
+from processing.caveats import caveats, rests_on_little
 from processing.edge_arrays import read_edge_arrays
 from processing.geometry import Array
 from processing.map_files import MapImage, read_map
@@ -65,7 +66,8 @@ def make_page(atlas: Path) -> str:
         name=escape(atlas.resolve().name),
         summary=_summary(document, trails),
         overview=draw_overview(document, image, trails),
-        remarks=_items(caveats(document)) or "<li>Nothing: all of every run is in the map.</li>",
+        remarks=_remarks(document),
+        convictions=_convictions(document),
         runs=_runs(document, trails),
         nodes="".join(_node(node, image, trails) for node in document["nodes"]),
         edges=_edge_table(edges),
@@ -86,6 +88,22 @@ def _summary(document: Document, trails: Mapping[str, Array]) -> str:
         f"{mapped:.0f} m from beacon to beacon · {parts} connected part{'s' * (parts > 1)} · "
         f"{escape(', '.join(made))}"
     )
+
+
+def _remarks(document: Document) -> str:
+    told, weak = caveats(document), rests_on_little(document)
+    little = [f"The map rests on little: {', '.join(weak)}."] if weak else []
+    lines = _items([*little, *told["left_out"], *told["remarks"]])
+    return lines or "<li>Nothing: all of every run is in the map.</li>"
+
+
+def _convictions(document: Document) -> str:
+    """What contradicted the rest and was not believed; nothing where all was."""
+    rows = [
+        (escape(found["run"]), "{} to {}".format(*found["ticks"]), escape(found["what"]), escape(found["how_much"]))
+        for found in document.get("convictions", [])
+    ]
+    return _table(("run", "ticks", "not believed", "how much"), rows) if rows else ""
 
 
 def _runs(document: Document, trails: Mapping[str, Array]) -> str:

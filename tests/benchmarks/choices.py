@@ -56,7 +56,7 @@ WHOLE = """## Whole maps
 
 Every choice, from the recordings to the atlas. Those that take long or say nothing new on a world are left out there;
 so is the largest world, 3 km of smooth tunnels, which `--worlds tunnels` measures. On simulated worlds a row is the
-mean over the seeds, the worst seed in brackets. ATE: one rigid move of each connected part of the atlas onto the
+mean over the seeds, the worst seed in brackets. ATE: one rigid move of the whole atlas onto the
 truth, rms over all poses of all runs. RPE: relative error over 10 m and 100 m of driving. Precision and recall are
 those of the wall cells of the map: a wall drawn twice lowers the precision. NEES: squared error of the edges over
 their stated covariance, 3 where that is right ([accuracy.md](accuracy.md)); of few edges it scatters. CPU: of the

@@ -126,7 +126,7 @@ def test_turn_arounds_standing_still_and_lost_ticks(mapped: Callable[..., Mapped
 
 def test_unconnected_parts_and_runs_of_few_tags(mapped: Callable[..., Mapped]) -> None:
     found = mapped("islands")
-    assert found.ate_m < 0.05
+    assert found.truth["ate_each_part"]["rmse_m"] < 0.05
     assert found.truth["parts"] == 4
     said = "\n".join(found.said)
     assert "the map falls into 4 unconnected parts" in said

@@ -201,6 +201,10 @@ def test_what_is_no_atlas_is_refused(tmp_path: Path, text: str | None, complaint
         ),
         ({"edges": [EDGE | {"kind": "bow"}]}, r"Invalid enum value 'bow'"),
         ({"edges": [EDGE | {"j": 2}]}, "edge 0-1 ends at a node that is not there"),
+        (
+            {"convictions": [{"run": "monday", "ticks": [3], "what": "wheels", "how_much": "slip"}]},
+            r"Expected `array` of length 2, got 1 at `convictions\[0\]\.ticks`",
+        ),
         ({"runs": RUNS[1:]}, "edge 0-1 holds a path of monday, which is no run of it"),
     ],
 )

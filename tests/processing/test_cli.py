@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -91,9 +92,57 @@ def test_build_tells_what_it_made_and_leaves_nothing_else(small_world: Path, tmp
     assert result.returncode == 0
     summary = json.loads(result.stdout)
     assert summary.pop("seconds") > 0
-    assert summary == {"atlas": f"{tmp_path}/a.atlas", "runs": 1, "nodes": 0, "edges": 0, "parts": 1}
+    counts = {kind: summary.pop(kind) for kind in ("convictions", "left_out", "remarks")}
+    assert sum(counts.values()) == len(result.stderr.splitlines())
+    made = {"atlas": f"{tmp_path}/a.atlas", "runs": 1, "nodes": 0, "edges": 0, "parts": 1, "rests_on_little": []}
+    assert summary == made
     assert all(line.startswith("rtlog-atlas: run small-back ") for line in result.stderr.splitlines())
     assert [path.name for path in tmp_path.iterdir()] == ["a.atlas"]
+
+
+FINISHING = """
+import json, sys
+import processing.build
+from pathlib import Path
+from processing.atlas import Atlas
+from processing.cli import main
+
+document = json.loads((Path(sys.argv[1]) / "atlas.json").read_text())
+processing.build.build = lambda *_: Atlas(document, {})
+sys.exit(main(["build", "a.mcap", "-o", sys.argv[1]]))
+"""
+
+
+def finish(atlas: Path, document: dict[str, Any]) -> subprocess.CompletedProcess[str]:
+    """What `build` says in the end where the map that it made has this document."""
+    atlas.mkdir()
+    (atlas / "atlas.json").write_text(json.dumps(document))
+    command = [sys.executable, "-c", FINISHING, atlas]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+
+
+def test_a_build_of_which_there_is_nothing_to_know_says_no_more(small_atlas: Path, tmp_path: Path) -> None:
+    document = json.loads((small_atlas / "atlas.json").read_text()) | {"remarks": [], "left_out": []}
+    said = finish(tmp_path / "a.atlas", document)
+    assert said.stderr == ""
+    assert said.stdout.endswith(f"; look at {tmp_path / 'a.atlas' / 'map.png'}\n")
+
+
+def test_a_build_that_rests_on_little_is_no_plain_success(small_atlas: Path, tmp_path: Path) -> None:
+    slips = [
+        {"run": "small-back", "ticks": [k, k + 9], "what": "wheels", "how_much": "slip"} for k in range(0, 300, 10)
+    ]
+    document = json.loads((small_atlas / "atlas.json").read_text())
+    said = finish(tmp_path / "a.atlas", document | {"convictions": slips, "remarks": ["the last thing to know"]})
+    assert said.stderr.splitlines()[19:] == [
+        "rtlog-atlas: run small-back, ticks 190 to 199: wheels not believed, slip",
+        f"rtlog-atlas: 10 more convictions; rtlog-atlas info {tmp_path / 'a.atlas'} shows all",
+        "rtlog-atlas: the last thing to know",
+    ]
+    assert said.stdout.endswith(", with 31 things to know above; it rests on little: 30 stretches not believed\n")
+    notes = [line for line in run("info", tmp_path / "a.atlas").stdout.splitlines() if line.startswith("note")]
+    assert len(notes) == 32
+    assert notes[-1] == "note  the map rests on little: 30 stretches not believed"
 
 
 @contextmanager

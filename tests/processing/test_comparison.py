@@ -65,15 +65,50 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 def test_a_moved_truth_is_right_in_everything(folders) -> None:
     figures = compare_truth(*folders)["truth"]
     assert (figures["parts"], figures["runs_without_truth"], figures["ate"]["stamps"]) == (2, [], 600)
-    assert_allclose(figures["ate"]["rmse_m"], 0, atol=1e-5)
+    assert_allclose(figures["ate_each_part"]["rmse_m"], 0, atol=1e-5)
     assert_allclose([error["translation_rmse_m"] for error in figures["rpe"]], [0], atol=1e-5)  # 36 m hold no 100 m
     assert_allclose([figures["beacon_error_m"]["max"], figures["edge_length_error_m"]["max"]], 0, atol=1e-5)
     assert_allclose(figures["beacons"][0]["to_tag_m"], 2.0, atol=1e-3)
     assert (figures["beacon_error_m"]["count"], figures["edge_length_error_m"]["count"]) == (4, 2)
     assert (figures["walls"]["precision"], figures["walls"]["recall"]) == (1.0, 1.0)
-    text = table(json.loads(json.dumps({"truth": figures})))
-    assert "2, each aligned for itself" in text
-    assert "1.0000 of" in text
+    assert "1.0000 of" in table(json.loads(json.dumps({"truth": figures})))
+
+
+def test_parts_that_lie_wrongly_to_each_other_are_wrong(folders) -> None:
+    """How many parts there are is said first, then the error of the whole, and only then that of each part."""
+    atlas, truth = folders
+    figures = compare_truth(atlas, truth)["truth"]
+    assert_allclose(figures["largest_part_share"], 0.5, atol=1e-6)
+    assert figures["ate"]["rmse_m"] > 10
+    assert max(error["rmse_m"] for error in figures["ate_of_runs"].values()) > 10
+    first, second, *others = table({"truth": figures}).splitlines()
+    assert first.endswith("2; the largest holds 50.0 % of the way driven")
+    assert second.startswith("absolute trajectory error")
+    assert f"{figures['ate']['rmse_m']:.4f} m" in second
+    assert any(line.startswith("  each part for itself") and "0.0000 m" in line for line in others)
+    assert any(line.startswith("beacons and walls") and "each part aligned for itself" in line for line in others)
+
+
+def test_parts_that_lie_as_they_should_are_right(folders) -> None:
+    atlas, truth = folders
+    for run_id in MOVES:
+        write_tum(atlas / "trajectories" / f"{run_id}.tum", STAMPS, compose(MOVES["one"], truth_of(run_id)))
+    figures = compare_truth(atlas, truth)["truth"]
+    assert figures["parts"] == 2
+    assert_allclose(figures["ate"]["rmse_m"], 0, atol=1e-5)
+
+
+def test_the_table_of_a_whole_map_speaks_of_no_parts(folders) -> None:
+    atlas, truth = folders
+    document = json.loads((atlas / "atlas.json").read_text())
+    for edge in document["edges"]:
+        edge["part"] = 0
+    (atlas / "atlas.json").write_text(json.dumps(document))
+    figures = compare_truth(atlas, truth)["truth"]
+    assert figures["ate"] == figures["ate_each_part"]
+    first, *others = table({"truth": figures}).splitlines()
+    assert first.endswith("1; the largest holds 100.0 % of the way driven")
+    assert not any("each part" in line for line in others)
 
 
 def test_a_wrong_map_shows(folders) -> None:
@@ -81,9 +116,8 @@ def test_a_wrong_map_shows(folders) -> None:
     poses = compose(MOVES["one"], truth_of("one") * [1.02, 1, 1])
     write_tum(atlas / "trajectories" / "one.tum", STAMPS, poses)
     figures = compare_truth(atlas, truth)["truth"]
-    # 36 m stretched by 2 % about their middle: uniform between ±0.36 m
-    assert_allclose(figures["ate_of_runs"]["one"]["rmse_m"], 0.36 / np.sqrt(3), rtol=0.01)
-    assert_allclose(figures["ate_of_runs"]["two"]["rmse_m"], 0, atol=1e-5)
+    # one of two drives of 36 m stretched by 2 % about its middle: uniform between ±0.36 m
+    assert_allclose(figures["ate_each_part"]["rmse_m"], 0.36 / np.sqrt(3) / np.sqrt(2), rtol=0.01)
     assert_allclose(
         figures["rpe"][0]["translation_rmse_m"], 0.2 / np.sqrt(2), rtol=0.02
     )  # pairs end a step of 0.12 m late
@@ -96,6 +130,8 @@ def test_what_the_truth_lacks_is_told(folders) -> None:
     figures = compare_truth(atlas, truth)["truth"]
     assert (figures["runs_without_truth"], figures["walls"], figures["beacons"][0]["to_tag_m"]) == (["two"], None, None)
     assert figures["beacon_error_m"]["count"] == 2
+    assert (figures["parts"], figures["ate"]["stamps"]) == (2, 300)
+    assert_allclose(figures["largest_part_share"], 0.5, atol=1e-6)
     assert "two" in table({"truth": figures})
 
 

@@ -10,12 +10,15 @@ from processing.evaluation import (
     Trajectory,
     absolute_error,
     align_parts,
+    align_whole,
     beacon_errors,
     distribution,
     edge_length_errors,
+    largest_part_share,
     match_truth,
     relative_error,
     true_place,
+    way_driven,
 )
 from processing.geometry import accumulate, compose, inverse, transform
 
@@ -49,6 +52,16 @@ def test_parts_move_apart_but_a_whole_does_not() -> None:
     runs = {"a": Matched(compose(MOVE, drive()), drive(), 0), "b": Matched(drive(), drive(), 0)}
     assert_allclose(figures(runs, {"a": 0, "b": 1}).rmse_m, 0, atol=1e-9)
     assert figures(runs, {"a": 0, "b": 0}).rmse_m > 5
+    parts = {"a": 0, "b": 1}
+    assert absolute_error(runs, parts, align_whole(runs, parts)) == figures(runs, {"a": 0, "b": 0})
+
+
+def test_the_largest_part_holds_its_share_of_the_way_driven() -> None:
+    ways_m = {"a": way_driven(drive()), "b": way_driven(drive()[:101]), "c": way_driven(drive()[:101])}
+    assert_allclose(list(ways_m.values()), [300, 100, 100])
+    assert_allclose(largest_part_share(ways_m, {"a": 0, "b": 1, "c": 1}), 0.6)
+    assert_allclose(largest_part_share(ways_m, {"a": 0, "b": 1, "c": 0}), 0.8)
+    assert largest_part_share({"a": 0.0}, {"a": 0}) == 1.0  # it stood still
 
 
 def test_known_disturbance_of_positions() -> None:

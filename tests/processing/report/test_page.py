@@ -81,10 +81,14 @@ def test_what_was_left_out_is_said(small_atlas: Path, tmp_path: Path) -> None:
     document = json.loads((copy / "atlas.json").read_text(encoding="utf-8"))
     document["left_out"] = [{"what": "tag <X>", "run": "r", "ticks": [7, 9], "reason": "it was moved"}]
     document["remarks"] = ["one & all"]
+    document["convictions"] = [{"run": "r & r", "ticks": [40, 55], "what": "wheels", "how_much": "2.5° <a tick>"}]
     (copy / "atlas.json").write_text(json.dumps(document), encoding="utf-8")
     page = Page(make_page(copy))
     assert "tag <X> is left out of run r, ticks 7, 9: it was moved" in page.words
     assert "one & all" in page.words
+    assert "The map rests on little: 1 stretch not believed." in page.words
+    at = page.words.index("r & r")
+    assert page.words[at : at + 4] == ["r & r", "40 to 55", "wheels", "2.5° <a tick>"]
     assert page.words.count("a<b>.atlas") == 2
 
 

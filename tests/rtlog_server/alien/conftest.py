@@ -1,5 +1,6 @@
 """A driver that runs against an emulated ALR-9650, over real sockets and a real pseudo-terminal."""
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,9 @@ from rtlog_server.devices.alien.emulator import Alr9650Emulator
 from rtlog_server.devices.device import TickGrid
 from rtlog_server.devices.rfid import TagSample
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from patience import PATIENCE_S, Told
+
 EPCS = [f"E2000016591900781840{number:04X}" for number in range(5)]
 
 
@@ -20,15 +24,23 @@ class Reader:
 
     def __init__(self, settings: RfidDevice) -> None:
         self.device = Alr9650("rfid", settings)
+        self.told = Told(self.device)
         self.samples: list[TagSample] = []
         self.device.start(TickGrid(time.monotonic_ns(), 100_000_000))
 
-    def wait_for(self, condition: Callable[[], bool], timeout_s: float = 8.0) -> None:
-        deadline_s = time.monotonic() + timeout_s
+    def wait_for(
+        self,
+        condition: Callable[[], bool],
+    ) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < deadline_s, f"{self.device.message}; {self.device.diagnostics}; {self.samples}"
             time.sleep(0.005)
             self.collect()
+
+    def wait_for_message(self, part: str) -> None:
+        """It may be over by then."""
+        self.wait_for(lambda: self.told(part))
 
     def collect(self) -> int:
         collected = self.device.collect(time.monotonic_ns())

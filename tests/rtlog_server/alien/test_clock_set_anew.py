@@ -20,7 +20,7 @@ def test_reads_keep_their_time_when_the_clock_was_set_anew(
     reader.wait_for_epc(epcs[0])
     emulator.power_off()
     emulator.power_on()
-    reader.wait_for(lambda: reader.device.connects == 2)
+    reader.wait_for(lambda: reader.device.connects >= 2)
     reader.wait_until_reading()
     before_ns = time.monotonic_ns()
     emulator.read_tag(epcs[1])

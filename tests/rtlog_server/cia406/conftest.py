@@ -1,7 +1,7 @@
 """Emulated encoders on a CAN bus, and their driver, collected at each tick."""
 
-import math
 import socket
+import sys
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +12,9 @@ import pytest
 from hw_profiles.profile import CanBus, Encoder
 from rtlog_server.devices.cia406.driver import Cia406Encoders
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from wheels import Wheels
 
 COUNTS = 4096
 PERIOD_NS = 40_000_000
@@ -45,9 +48,9 @@ def two_wheels() -> tuple[Encoder, ...]:
 
 
 @pytest.fixture
-def turning() -> Callable[[int, int], int]:
-    """Two wheels at a steady speed: counts over many turns, of a node at a time [ns]."""
-    return lambda node, at_ns: math.floor(at_ns * 1e-9 * TURNS_PER_S[node] * COUNTS)
+def turning() -> Wheels:
+    """Two wheels at a steady speed."""
+    return Wheels(TURNS_PER_S, COUNTS)
 
 
 @pytest.fixture

@@ -1,9 +1,11 @@
 """An emulated scanner that measures, a driver in its thread, and what a tick thread collects from it."""
 
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,16 +14,15 @@ import pytest
 from hw_profiles.profile import LaserDevice
 from rtlog_server.devices.device import TickGrid
 from rtlog_server.devices.laser import Scan
+from rtlog_server.devices.lms111 import driver
 from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.messages import MISSING
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from patience import Told, wait_until
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {timeout_s} s"
-        time.sleep(0.005)
+ROUNDED_NS = 300_000  # what a clock that drifts by 100 ppm, and counts microseconds, may be off by in some seconds
 
 
 class Feeder:
@@ -53,16 +54,24 @@ class Feeder:
     def index(self, scan: Scan) -> int:
         return round((float(scan.ranges_m[0]) - 1.0) * 1e3)
 
-    def errors_ms(self, scans: list[Scan]) -> np.ndarray:
-        """(N,) stamps of the first rays against the truth."""
-        return np.array([scan.measured_ns - self.first_rays_ns[self.index(scan)] for scan in scans]) * 1e-6
+    def assert_true_stamps(self, scans: list[Scan], arrived_ns: list[int]) -> None:
+        """No first ray is stamped earlier than it was, or later by more than the fastest delivery so far took.
+
+        So it must be however late the threads of either end run: from the last ray to the arrival takes longer still.
+        """
+        first_rays_ns = np.array([self.first_rays_ns[self.index(scan)] for scan in scans])
+        late_ns = np.array([scan.measured_ns for scan in scans]) - first_rays_ns
+        sweeps_ns = np.array([scan.complete_ns - scan.measured_ns for scan in scans])
+        delivered_ns = np.array(arrived_ns) - first_rays_ns - sweeps_ns
+        assert late_ns.min() > -ROUNDED_NS
+        assert np.all(late_ns < np.minimum.accumulate(delivered_ns) + ROUNDED_NS)
 
     def _run(self) -> None:
-        due = time.monotonic()
-        while not self._stopping.wait(max(0.0, due - time.monotonic())):
-            due += self._period_s
+        due_ns = time.monotonic_ns()
+        while not self._stopping.wait(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9)):
             k = len(self.first_rays_ns)
-            self.first_rays_ns.append(time.monotonic_ns())
+            self.first_rays_ns.append(due_ns)  # a motor keeps its pace, whenever this thread wakes up
+            due_ns += int(self._period_s * 1e9)
             second = () if self._second_echo is None else self._second_echo(k)
             remission = np.arange(self.rays) * 10.0
             first_ray_ns = self.first_rays_ns[k]
@@ -78,7 +87,10 @@ class Drive:
 
     def __init__(self, address: tuple[str, int], **settings: Any) -> None:
         self.driver = Lms111("laser/primary", LaserDevice(host=address[0], port=address[1], **settings))
+        self.told = Told(self.driver)
         self.scans: list[Scan] = []
+        self.arrived_ns: list[int] = []  # when the driver had each of them, and of those that are not collected yet
+        self._hand_over, self.driver.hand_over = self.driver.hand_over, self._note_arrival  # type: ignore[method-assign]
         self.state = MISSING
         self.driver.start(TickGrid(0, 100_000_000))
 
@@ -88,26 +100,36 @@ class Drive:
         self.state = collected.state
         return collected.samples
 
-    def wait_scans(self, count: int, timeout_s: float = 5.0) -> list[Scan]:
+    def _note_arrival(self, scan: Scan) -> None:
+        self.arrived_ns.append(time.monotonic_ns())
+        self._hand_over(scan)
+
+    def wait_scans(self, count: int) -> list[Scan]:
         """This many scans more."""
         have = len(self.scans)
-        wait_until(lambda: self.collect() is not None and len(self.scans) >= have + count, timeout_s)
+        wait_until(lambda: self.collect() is not None and len(self.scans) >= have + count, lambda: self.driver.message)
         return self.scans[have:]
 
-    def wait_message(self, text: str, timeout_s: float = 5.0) -> None:
-        wait_until(lambda: text in self.driver.message, timeout_s)
+    def wait_state(self, state: int) -> None:
+        wait_until(lambda: self.collect() is not None and self.state == state, lambda: self.driver.message)
 
-    def wait_lost(self) -> None:
-        """Wait until the driver has noticed; scans that are still under way are let go."""
-        wait_until(lambda: not self.driver.connected, 2.0)
-        time_ns = time.monotonic_ns()
-        wait_until(lambda: self.driver.collect(time_ns).samples == [])
+    def wait_message(self, text: str) -> None:
+        """It may be over by then."""
+        wait_until(lambda: self.told(text), lambda: self.driver.message)
+
+    def lose(self, how: Callable[[], object]) -> list[Scan]:
+        """Lose the connection in this way, and wait until the driver is back; scans from before and after it."""
+        have, connects = len(self.scans), self.driver.connects
+        how()
+        wait_until(lambda: self.driver.connects > connects, lambda: self.driver.message)
+        self.collect()
+        return self.scans[have:]
 
 
-@pytest.fixture(name="wait_until")
-def wait_until_fixture() -> Callable[..., None]:
-    """Waits for a condition, with a deadline."""
-    return wait_until
+@pytest.fixture(autouse=True)
+def patient_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scanner that sends nothing for a while is asked, and on a busy machine its answer may take long."""
+    monkeypatch.setattr(driver, "PROBE_S", 10.0)
 
 
 @pytest.fixture

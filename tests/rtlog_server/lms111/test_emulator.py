@@ -2,8 +2,10 @@
 
 import random
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,9 @@ from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.lms111.protocol import AUTHORISED_CLIENT, Command, decode, encode_command
 from rtlog_server.devices.lms111.scan_data import ScanData
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from patience import PATIENCE_S
+
 MS = 1_000_000
 STEP_RAD = np.radians(0.5)
 
@@ -23,7 +28,7 @@ class Client:
     """Asks and waits for the next telegram."""
 
     def __init__(self, emulator: Lms111Emulator, dialect: Dialect = Dialect.B) -> None:
-        self.socket = socket.create_connection(emulator.address, 2.0)
+        self.socket = socket.create_connection(emulator.address, PATIENCE_S)
         self.dialect = dialect
         self._receiver = Receiver(dialect)
         self._payloads: list[bytes] = []
@@ -121,7 +126,7 @@ def test_a_scan_goes_to_who_asked_for_it_after_its_last_ray(emulator: Lms111Emul
     client.ask("sRN STlms")
     assert not emulator.wait_streaming(0)
     assert client.ask("sEN LMDscandata", 1) == ("sEA LMDscandata", (1,))
-    assert emulator.wait_streaming(1)
+    assert emulator.wait_streaming(PATIENCE_S)
     first_ray_ns = time.monotonic_ns() + 20 * MS
     emulator.send_scan(np.full(541, 3.0), first_ray_ns, np.radians(-135), STEP_RAD, np.full(541, 7.0))
     scan = client.next()
@@ -179,7 +184,7 @@ def test_the_clock_drifts_and_wraps(connect: Connect) -> None:
         assert isinstance(a, ScanData)
         assert isinstance(b, ScanData)
         assert (b.time_since_startup_us - a.time_since_startup_us) % 2**32 == pytest.approx(100_100, abs=1)
-        assert b.time_since_startup_us < 10_000_000
+        assert b.time_since_startup_us < 2**31
 
 
 def test_the_dialect_changes_with_the_next_connection(emulator: Lms111Emulator, connect: Connect) -> None:

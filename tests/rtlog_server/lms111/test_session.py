@@ -3,6 +3,7 @@
 import json
 import random
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from hw_profiles.profile import LaserDevice
+from rtlog_server.devices import lms111
 from rtlog_server.devices.device import DeviceError, TickGrid
 from rtlog_server.devices.laser import Scan
 from rtlog_server.devices.lms111.cola import Dialect, Receiver, frame
@@ -22,6 +24,9 @@ from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.identity import identify
 from rtlog_server.devices.lms111.protocol import Command, decode, encode_command, reply_name
 from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from patience import PATIENCE_S, Told, wait_until
 
 CAPTURES = Path(__file__).parents[4] / "shared" / "data" / "lms111"
 needs_captures = pytest.mark.skipif(not CAPTURES.is_dir(), reason=f"no captured sessions in {CAPTURES}")
@@ -67,7 +72,7 @@ class Peer:
                         self._stream(connection)
 
     def close(self) -> None:
-        self._thread.join(5)
+        self._thread.join(PATIENCE_S)
         self._listener.close()
 
 
@@ -78,13 +83,21 @@ def telegrams(replies: dict[str, tuple[Any, ...]]) -> dict[str, bytes]:
 OpenPeer = Callable[..., tuple[Peer, Lms111]]
 
 
+class ToldLms111(Lms111):
+    """Keeps what it said."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__("laser/primary", LaserDevice(host="127.0.0.1", port=port))
+        self.told = Told(self)
+
+
 @pytest.fixture
 def open_peer() -> Iterator[OpenPeer]:
-    opened: list[tuple[Peer, Lms111]] = []
+    opened: list[tuple[Peer, ToldLms111]] = []
 
-    def open_peer(*arguments: Any) -> tuple[Peer, Lms111]:
+    def open_peer(*arguments: Any) -> tuple[Peer, ToldLms111]:
         peer = Peer(*arguments)
-        opened.append((peer, Lms111("laser/primary", LaserDevice(host="127.0.0.1", port=peer.port))))
+        opened.append((peer, ToldLms111(peer.port)))
         opened[-1][1].start(TickGrid(0, 100_000_000))
         return opened[-1]
 
@@ -94,15 +107,9 @@ def open_peer() -> Iterator[OpenPeer]:
         peer.close()
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {timeout_s} s"
-        time.sleep(0.005)
-
-
 @needs_captures
-def test_the_captured_session(open_peer: OpenPeer) -> None:
+def test_the_captured_session(open_peer: OpenPeer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lms111.driver, "SILENCE_S", PATIENCE_S)  # this peer can hear no question while it plays
     raw = (CAPTURES / "colab_dev2host.bin").read_bytes()
     index = [entry for entry in json.loads((CAPTURES / "colab_index.json").read_text()) if entry["dir"] == "dev>host"]
     expected = {scan["telegram_counter"]: scan for scan in json.loads((CAPTURES / "colab_decoded.json").read_text())}
@@ -144,8 +151,8 @@ def test_the_captured_session(open_peer: OpenPeer) -> None:
     assert driver.identity == {"model": "LMS111", "firmware": "V1.80.2", "serial_number": "18090362"}
     device_ms = np.array([expected[scan.telegram_counter]["time_since_startup_us"] for scan in scans]) * 1e-3
     host_ms = np.array([scan.measured_ns for scan in scans]) * 1e-6
-    wrong_ms = (host_ms - device_ms) - np.median(host_ms - device_ms)
-    assert np.percentile(np.abs(wrong_ms), 75) < 1.0
+    # Between the clocks lies what the fastest delivery so far took: it shrinks, and no late telegram makes it grow.
+    assert np.diff(host_ms - device_ms).max() < 0.2  # which is how well a turn of the motor is timed
     written = [command for command in peer.commands if command.name.startswith("sWN")]
     assert written == [Command("sWN LMDscandatacfg", (1, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 1))]  # all else is as wanted
 
@@ -160,8 +167,8 @@ def scan_telegrams(*which: int) -> bytes:
 def test_events_between_command_and_reply(open_peer: OpenPeer) -> None:
     between = scan_telegrams(0) + encode_command(Dialect.B, "sEA LIDinputstate", 1)
     peer, driver = open_peer({name: between + reply for name, reply in telegrams(REPLIES).items()})
-    wait_until(lambda: len(peer.commands) == len(REPLIES))
-    wait_until(lambda: driver.connected)
+    wait_until(lambda: driver.connects)
+    assert len(peer.commands) == len(REPLIES)
     assert not [command.name for command in peer.commands if command.name.startswith("sWN")]
 
 
@@ -195,7 +202,7 @@ def test_the_same_scan_again_and_again_is_no_sign_of_life(open_peer: OpenPeer) -
             time.sleep(0.02)
 
     _, driver = open_peer(telegrams(REPLIES), repeat)
-    wait_until(lambda: "no scan for 0.5 s" in driver.message)
+    wait_until(lambda: driver.told("no scan for 0.5 s"))
     assert driver.diagnostics["scans"] == "1"
 
 
@@ -243,7 +250,7 @@ def test_only_what_differs_is_written(open_peer: OpenPeer) -> None:
         "sWN LMPoutputRange": (),
     }
     peer, driver = open_peer(telegrams(REPLIES | present))
-    wait_until(lambda: driver.connected)
+    wait_until(lambda: driver.connects)
     changes = [c for c in peer.commands if c.name.startswith("sWN") or c.name == "sMN mLMPsetscancfg"]
     assert changes == [
         Command("sMN mLMPsetscancfg", (5000, 1, 5000, -450000, 2250000)),
@@ -274,26 +281,27 @@ def test_a_device_that_refuses_or_is_not_ready_says_so(
     present: dict[str, Any], message: str, open_peer: OpenPeer
 ) -> None:
     _, driver = open_peer(telegrams(REPLIES | present))
-    wait_until(lambda: message in driver.message)
+    wait_until(lambda: driver.told(message))
 
 
 def test_an_error_names_the_command(open_peer: OpenPeer) -> None:
     replies = telegrams(REPLIES) | {"sRN LMDscandatacfg": encode_command(Dialect.B, "sFA", 3)}
     peer, driver = open_peer(replies)
-    wait_until(lambda: "refuses sRN LMDscandatacfg: unknown variable (sFA 3)" in driver.message)
-    assert f"LMS111 at 127.0.0.1:{peer.port}" in driver.message
+    wait_until(
+        lambda: driver.told(f"LMS111 at 127.0.0.1:{peer.port} refuses sRN LMDscandatacfg: unknown variable (sFA 3)")
+    )
 
 
 def test_a_command_that_is_not_answered_is_named(open_peer: OpenPeer) -> None:
     replies = telegrams(REPLIES)
     del replies["sRN LMPscancfg"]
     _, driver = open_peer(replies)
-    wait_until(lambda: driver.message.endswith("no answer to sRN LMPscancfg"))
+    wait_until(lambda: driver.told("no answer to sRN LMPscancfg"))
 
 
 def test_a_cut_reply_is_a_device_error(open_peer: OpenPeer) -> None:
     _, driver = open_peer(telegrams(REPLIES) | {"sRN LMPscancfg": frame(Dialect.B, b"sRA LMPscancfg \x00\x00")})
-    wait_until(lambda: "telegram ends early" in driver.message)
+    wait_until(lambda: driver.told("telegram ends early"))
 
 
 IDLE = {"sRN STlms": (3, 0, "00:34:19", "01.01.1970", 0, 0, 0)}

@@ -1,6 +1,6 @@
 """A driver that runs against emulated encoders, over a real pseudo-terminal."""
 
-import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,9 @@ import pytest
 
 from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.sei.driver import SeiEncoders
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from wheels import Wheels
 
 COUNTS = 4096
 PERIOD_NS = 33_300_000  # no multiple of the 4 ms in which an encoder looks at its disc
@@ -31,9 +34,9 @@ def counts() -> dict[int, int]:
 
 
 @pytest.fixture
-def turning() -> Callable[[int, int], int]:
-    """Two wheels at a steady speed: (address, monotonic ns) → counts over many turns."""
-    return lambda address, at_ns: math.floor(at_ns * 1e-9 * TURNS_PER_S[address] * COUNTS)
+def turning() -> Wheels:
+    """Two wheels at a steady speed."""
+    return Wheels(TURNS_PER_S, COUNTS)
 
 
 @pytest.fixture

@@ -1,8 +1,6 @@
 """The encoders' driver against emulated encoders that do as they should."""
 
-import itertools
 import math
-import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,16 +8,15 @@ from typing import Any
 import pytest
 
 from hw_profiles.profile import Encoder
+from rtlog_server.devices.sei import protocol
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 from rtlog_server.devices.sei.round_timing import MAX_LATE_NS, SAFETY_NS, RoundTiming
 
 COUNTS = 4096
-TURNS_PER_S = {0: 2.3, 5: -1.7}  # as `turning` does
-SIGNS = {0: 1, 5: -1}  # the right wheel counts backward
-LATCH_S = 0.005  # the look at the disc each 4 ms, and a busy machine
+ADDRESSES = {"left_wheel": 0, "right_wheel": 5}
 
 Start = Callable[..., Any]
-Turning = Callable[[int, int], int]
+Turning = Any  # the fixture of conftest.py
 Counts = dict[int, int]
 
 
@@ -32,40 +29,18 @@ def test_positions_at_their_stamp_are_the_true_ones_over_many_turns(
 ) -> None:
     with SeiBusEmulator(link, counts, turning, echo=echo, multi_turn=turns == "multi", strobe=strobe):
         bus = start(turns=turns, strobe=strobe)
-        bus.wait_for_readings(22)
-    errors_s: dict[int, list[float]] = {0: [], 5: []}
-    # the first has no speed yet; a machine with other work may let an answer wait for too long
-    first, *readings = [r for r in bus.readings if r.names == ("left_wheel", "right_wheel") and not r.doubtful]
-    assert len(readings) > 15
-    for reading in readings:
-        elapsed_ns = reading.measured_ns - first.measured_ns
-        for index, address in enumerate(counts):
-            moved_rad = reading.positions_rad[index] - first.positions_rad[index]
-            true_rad = SIGNS[address] * 2 * math.pi * TURNS_PER_S[address] * elapsed_ns * 1e-9
-            assert abs(moved_rad - true_rad) < math.pi / 2  # no turn too many or too few
-            true_counts = turning(address, reading.measured_ns)
-            error = (
-                SIGNS[address] * reading.positions_rad[index] / (2 * math.pi) - true_counts / COUNTS + 0.5
-            ) % 1 - 0.5
-            errors_s[address].append(error / TURNS_PER_S[address])
-    for address in counts:
-        assert sorted(map(abs, errors_s[address]))[12] < LATCH_S  # the rest: a machine with other work
-        assert abs(statistics.median(errors_s[address])) < 0.002  # each at the common stamp, not only their mean
-    assert abs(bus.readings[-1].counts[0] - first.counts[0]) > 1.4 * COUNTS
+        bus.wait_for(lambda: sum(len(reading.names) == 2 for reading in bus.readings) >= 22)
+    for reading, looked_ns in zip(bus.readings, turning.looked_ns(bus.readings, ADDRESSES), strict=True):
+        mean_ns = sum(looked_ns.values()) / len(looked_ns)
+        assert reading.measured_ns - protocol.SNAPSHOT_NS / 2 <= mean_ns  # a look is as old as that at the most
+        assert max(looked_ns.values()) <= reading.complete_ns
+    first, *_, last = (reading for reading in bus.readings if len(reading.names) == 2)
+    for index, sign in enumerate((1, -1)):  # the right wheel counts backward
+        turned_rad = math.tau * (last.counts[index] - first.counts[index]) / COUNTS
+        assert last.positions_rad[index] - first.positions_rad[index] == pytest.approx(sign * turned_rad, abs=math.pi)
+    bus.assert_one_a_tick()
     assert bus.device.diagnostics["echo"] == ("yes" if echo else "no")
     assert bus.device.identity["right_wheel"].endswith(f"address 5, serial number 61005, {turns}-turn, ok")
-
-
-def test_each_tick_has_a_reading_taken_just_before_it(
-    link: Path, start: Start, counts: Counts, turning: Turning
-) -> None:
-    with SeiBusEmulator(link, counts, turning):
-        bus = start()
-        bus.wait_for_readings(30)
-    settled = sorted(bus.ages_s[5:])
-    assert settled[len(settled) // 2] < 0.025  # `bench_sei.py` measures it
-    stamps = [reading.measured_ns for reading in bus.readings]
-    assert all(after - before > 0.4 * 33_300_000 for before, after in itertools.pairwise(stamps))
 
 
 def test_steering_is_signed_about_its_zero(link: Path, start: Start) -> None:
@@ -90,10 +65,10 @@ def test_a_profile_with_the_wrong_turns_or_echo_is_told(
 ) -> None:
     with SeiBusEmulator(link, counts, turning, multi_turn=True):
         wrong_turns = start()
-        wrong_turns.wait_for(lambda: "encoder_bus.turns = 'single'" in wrong_turns.device.message)
+        wrong_turns.wait_for_message("encoder_bus.turns = 'single'")
         wrong_turns.device.close()
         wrong_echo = start(turns="multi", echo="yes")
-        wrong_echo.wait_for(lambda: "encoder_bus.echo is 'yes'" in wrong_echo.device.message)
+        wrong_echo.wait_for_message("encoder_bus.echo is 'yes'")
 
 
 def test_the_lead_follows_slow_rounds_up_to_a_bound_and_forgets_them() -> None:
