@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.chain_step import carry, invert, join, to_laser, to_vehicle
-from processing.fusion import fuse
+from processing.fusion import CHI_SQUARED_3_999, fuse
 from processing.match_search import agreement, search_match
 from processing.objection import objection
 from processing.scan_match import ScanMatch
@@ -36,6 +36,7 @@ ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
 SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
 GATE = 9.0  # wheels err by their radius and by slip, not only at random: three times the standard deviation is let pass
 HONEST = 3.0  # standard deviations that wheels may be off without being at fault
+LITTLE = 1e4  # times their covariance: as much as wheels are believed where the walls see as little
 OPEN = 100.0  # of what the two witnesses differ by, squared: the doubt of a match that may as well be moved so far
 OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them
 NEUTRAL = 0.005  # smooth walls, which fit there as well, differ by less
@@ -130,11 +131,13 @@ class Chain:
     ) -> None:
         """The wheels contradict a match, or led to none: who of the two is right?"""
         walls = self._motion_of(result)
-        missed = walls.pose - wheels.pose
+        # what the walls leave open they do not quarrel about
+        _, demanded, _ = fuse(wheels.pose, LITTLE * wheels.covariance, 1.0, walls.pose, walls.covariance)
+        missed = demanded - wheels.pose
         missed[2] = math.remainder(missed[2], 2 * math.pi)
         honest = _honest_share(missed, wheels.covariance)
-        at_wheels = to_laser(self.mount, self.mount, wheels.pose + honest)
-        against = objection(self.scan, scan, result.motion, at_wheels) if possible else -1.0
+        poses = (to_laser(self.mount, self.mount, pose) for pose in (demanded, wheels.pose + honest))
+        against = objection(self.scan, scan, *poses) if possible else -1.0
         within, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
         if np.allclose(honest, missed) or (within and NEUTRAL <= against < OBJECTS):
             self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
@@ -175,13 +178,13 @@ class Chain:
         return step if self.velocity is None else self.velocity * seconds
 
     def _is_possible(self, result: ScanMatch, onward: Array, seconds: float) -> bool:
-        """Could the vehicle have got there from its motion so far?"""
+        """Could the vehicle have got there from its motion so far, as far as the walls see?"""
         if self.velocity is None:
             return True
-        moved = join(invert(join(self.offset, onward)), self._motion_of(result).pose)
-        far = SPEED_UP_M_S2 * seconds**2 + STEP_M + 3 * math.sqrt(self.covariance[0, 0] + self.covariance[1, 1])
-        turned = TURN_UP_RAD_S2 * seconds**2 + STEP_RAD + 3 * math.sqrt(self.covariance[2, 2])
-        return math.hypot(moved[0], moved[1]) < far and abs(moved[2]) < turned
+        far, turned = SPEED_UP_M_S2 * seconds**2 + STEP_M, TURN_UP_RAD_S2 * seconds**2 + STEP_RAD
+        reach = self.covariance + np.diag([far**2, far**2, turned**2]) / CHI_SQUARED_3_999
+        walls = self._motion_of(result)
+        return fuse(join(self.offset, onward), reach, 1.0, walls.pose, walls.covariance)[0]
 
     def _without_wheels(self, step: Array, onward: Array, seconds: float) -> Motion:
         """Where convicted wheels and the motion so far put the vehicle together, and with what doubt."""

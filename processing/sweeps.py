@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Points = NDArray[np.float32]
 
+MAX_M_S, MAX_RAD_S = 20.0, 5.0
 AT_ONCE = 64  # scans straightened together
 
 
@@ -87,13 +88,18 @@ def sweeps_of(scans: Scans, odometry: Motions, mount: Array) -> Sweeps:
 
 
 def velocities_of(motions: Array, times: Array) -> Array:
-    """(n, 3) of the vehicle at each of `times` (n,), from the motions (n - 1, 3) between them."""
+    """(n, 3) of the vehicle at each of `times` (n,), from the motions (n - 1, 3) between them; in place of what no
+    vehicle does, as where a count starts anew, the one before.
+    """
     velocities = np.zeros((len(times), 3))
     if len(times) > 1:
         seconds = np.diff(times)
         seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
         velocities[:-1] = motions / seconds[:, None]
         velocities[-1] = velocities[-2]
+        possible = (np.hypot(velocities[:, 0], velocities[:, 1]) < MAX_M_S) & (np.abs(velocities[:, 2]) < MAX_RAD_S)
+        last = np.maximum.accumulate(np.where(possible, np.arange(len(times)), -1))
+        velocities = np.where(last[:, None] >= 0, velocities[last], 0.0)
     return velocities
 
 
