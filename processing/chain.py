@@ -36,14 +36,14 @@ ENOUGH_OVERLAP = 0.7  # fewer points in common: time for a new key frame
 SEARCH_M, SEARCH_RAD = 0.5, 0.6  # how far around the odometry a match is searched when all else failed
 GATE = 9.0  # wheels err by their radius and by slip, not only at random: three times the standard deviation is let pass
 HONEST = 3.0  # standard deviations that wheels may be off without being at fault
-LITTLE = 1e4  # times their covariance: as much as wheels are believed where the walls see as little
 OPEN = 100.0  # of what the two witnesses differ by, squared: the doubt of a match that may as well be moved so far
 OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them
 NEUTRAL = 0.005  # smooth walls, which fit there as well, differ by less
+HALF_TRACK_M = 0.8  # of a vehicle of this kind
 SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
 STEP_M, STEP_RAD = 0.05, 0.03  # what a match and a stamp may be off, besides
 AWRY = (0.3, 0.3, 0.2)  # m, m, rad: what convicted wheels may be off in one step, where the walls show nothing
-SLIPPED = (0.05, 0.05, 0.02)  # m, m, rad: and where the walls do
+SLIPPED = (0.05, 0.05, 0.02)  # m, m, rad: and where they do
 STEADY_M_S2, STEADY_RAD_S2 = 1.0, 1.0  # how fast motions usually change
 
 
@@ -132,7 +132,8 @@ class Chain:
         """The wheels contradict a match, or led to none: who of the two is right?"""
         walls = self._motion_of(result)
         # what the walls leave open they do not quarrel about
-        _, demanded, _ = fuse(wheels.pose, LITTLE * wheels.covariance, 1.0, walls.pose, walls.covariance)
+        ample = GATE * wheels.covariance + np.diag(np.square(SLIPPED))
+        _, demanded, _ = fuse(wheels.pose, ample, 1.0, walls.pose, walls.covariance)
         missed = demanded - wheels.pose
         missed[2] = math.remainder(missed[2], 2 * math.pi)
         honest = _honest_share(missed, wheels.covariance)
@@ -146,8 +147,9 @@ class Chain:
             _, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, unsure)
             self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
         elif within:  # a slip that is not worth to be told
-            deviations = math.sqrt(missed @ np.linalg.solve(wheels.covariance, missed))
-            doubted = wheels.covariance * max(1.0, (deviations / HONEST) ** 2)
+            quarrel = missed - honest
+            doubted = wheels.covariance + np.outer(quarrel, quarrel)
+            doubted[0, 0] += (HALF_TRACK_M * quarrel[2]) ** 2  # one wheel that slips counts the way wrongly as well
             _, *fused = fuse(wheels.pose, doubted, GATE, walls.pose, walls.covariance)
             self._arrive(k, Motion(*fused), Motion(wheels.pose, doubted), result.overlap, seconds)
         else:
