@@ -10,6 +10,8 @@ pass of the same tag is another cloud. The tag itself is never located: it only 
 In: reads of (pose index, EPC), open-loop poses. Out: passes in driving order, each with a centre of its own.
 """
 
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,8 +21,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MAX_GAP_POSES = 30  # a silence of 3 s at 0.1 s a tick, and
+MAX_GAP_POSES = 10  # a silence of 1 s at 0.1 s a tick, and
 MAX_GAP_M = 4.0  # of so many metres: a vehicle that stands still under a tag that answers now and then makes one pass
+THIN = 0.5  # of what its other clouds are long: a cloud that is read over less way is from elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,7 @@ class Pass:
     y: float
     range_m: float  # how far from the centre the tag was still read; half a chord, so short where the drive turned
     read: bool = True  # False: the vehicle drove by and read nothing, as the map shows
+    read_m: float = 0.0  # way driven while it was read: the same at any speed, and nothing where the vehicle stood
 
 
 def find_passes(
@@ -44,20 +48,21 @@ def find_passes(
 ) -> list[Pass]:
     """Cut each tag's reads into clouds wherever it was silent for too long, and reduce each to its centre and range."""
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    steps_m = np.gradient(travelled) if len(travelled) > 1 else np.zeros(1)
     clouds = []
     for epc in np.unique(epcs).tolist():
         reads = np.sort(indices[epcs == epc])
         silent = (np.diff(reads) > max_gap_poses) & (np.diff(travelled[reads]) > max_gap_m)
         for cloud in np.split(reads, np.flatnonzero(silent) + 1):
             first, last = int(cloud[0]), int(cloud[-1])
-            clouds.append(((first + last) // 2, epc, first, last))
+            clouds.append(((first + last) // 2, epc, first, last, float(steps_m[np.unique(cloud)].sum())))
     clouds.sort()
     centres = _apart(np.array([centre for centre, *_ in clouds], np.int64), len(poses))
     passes = []
-    for centre, (_, epc, first, last) in zip(centres.tolist(), clouds, strict=True):
+    for centre, (_, epc, first, last, read_m) in zip(centres.tolist(), clouds, strict=True):
         chord = np.hypot(*(poses[last, :2] - poses[first, :2]))
         x, y = poses[centre, :2].tolist()
-        passes.append(Pass(epc, centre, first, last, x, y, float(chord / 2)))
+        passes.append(Pass(epc, centre, first, last, x, y, float(chord / 2), read_m=read_m))
     return passes
 
 
@@ -69,6 +74,17 @@ def _apart(centres: Ints, count: int) -> Ints:
     rank = np.arange(len(centres))
     moved = np.maximum.accumulate(centres - rank) + rank
     return np.minimum(moved, count - len(centres) + rank)
+
+
+def thin_passes(runs: Sequence[Sequence[Pass]]) -> list[list[Pass]]:
+    """Of each run the passes whose clouds are thin beside the others of their tag: a few reads from far down the drift,
+    or through rock from the drift beside.
+    """
+    lengths_m: dict[str, list[float]] = defaultdict(list)
+    for found in (found for passes in runs for found in passes):
+        lengths_m[found.epc].append(found.read_m)
+    usual_m = {epc: float(np.quantile(of, 0.75)) for epc, of in lengths_m.items()}
+    return [[found for found in passes if found.read_m < THIN * usual_m[found.epc]] for passes in runs]
 
 
 def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from processing.beacons import Pass
+from processing.beacons import Pass, thin_passes
 from processing.edge_placement import Placement
 from processing.missed_tags import MappedRun, add_passes, find_missed
 from processing.moved_tags import OpenPasses, PassId, find_moved
@@ -19,6 +19,7 @@ from processing.scan_matching import Matcher
 from processing.trajectory import keyframe_poses
 
 REACH_M = 20.0  # from the middle of a cloud to its ends; no reader of passive tags reaches as far
+ELSEWHERE = "it was read over much less way than on its other passes: from elsewhere, down the drift or through rock"
 RIDES = "it was read on and on over more way than a reader reaches: it rides along"
 MOVED = "by its distance to other tags it was read at more than one place: moved, or two tags of one EPC"
 
@@ -27,7 +28,15 @@ if TYPE_CHECKING:
 
 
 def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[dict[str, Any]]]:
-    """The runs without the passes of tags that are at no one place, and what to tell of these."""
+    """The runs without reads from elsewhere and without tags that are at no one place, and what to tell of these."""
+    thin = thin_passes([run.passes for run in runs])
+    left_out = [
+        _left_out(run, found.epc, [found], ELSEWHERE) for run, of in zip(runs, thin, strict=True) for found in of
+    ]
+    runs = [
+        replace(run, passes=[found for found in run.passes if found not in of])
+        for run, of in zip(runs, thin, strict=True)
+    ]
     riding = {found.epc for run in runs for found in _passed_on_and_on(run)}
     staying = _without(runs, riding)
 
@@ -43,18 +52,18 @@ def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[di
 
     moved = find_moved([_open_passes(run) for run in staying], same_walls)
     reasons = dict.fromkeys(riding, RIDES) | dict.fromkeys(moved, MOVED)
-    left_out = [
-        {
-            "what": f"tag {epc}",
-            "run": run.run.run_id,
-            "ticks": [int(run.run.scan_ticks[found.centre]) for found in run.passes if found.epc == epc],
-            "reason": reason,
-        }
+    left_out += [
+        _left_out(run, epc, passes, reason)
         for epc, reason in sorted(reasons.items())
         for run in runs
-        if any(found.epc == epc for found in run.passes)
+        if (passes := [found for found in run.passes if found.epc == epc])
     ]
     return _without(staying, set(moved)), left_out
+
+
+def _left_out(run: "DrivenRun", epc: str, passes: list[Pass], reason: str) -> dict[str, Any]:
+    ticks = [int(run.run.scan_ticks[found.centre]) for found in passes]
+    return {"what": f"tag {epc}", "run": run.run.run_id, "ticks": ticks, "reason": reason}
 
 
 def _without(runs: list["DrivenRun"], epcs: set[str]) -> list["DrivenRun"]:
