@@ -60,7 +60,7 @@ def with_strays(
         if hazard.epc in (None, tag.epc) and len(ticks := _stray_ticks(hazard, grid, tag, place, position)):
             ticks_of[tag.epc] = ticks
     if not ticks_of:
-        strike.is_void(f"run {hazard.run} passes no place for it")
+        strike.refuse(f"run {hazard.run} passes no place for it")
         return readings
     epc = sorted(ticks_of)[rng.integers(len(ticks_of))]
     ticks = ticks_of[epc]

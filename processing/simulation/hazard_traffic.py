@@ -64,7 +64,7 @@ def obstacles(strikes: list[Strike], drive: Drive, mount: Mount) -> list[Obstacl
                 found.append(obstacle)
                 break
         else:
-            strike.is_void(f"there is no room for it on the way of run {hazard.run}")
+            strike.refuse(f"there is no room for it on the way of run {hazard.run}")
     return found
 
 

@@ -26,8 +26,8 @@ class Strike:
     what: str  # opens a line about it
     generator: np.random.Generator
 
-    def is_void(self, why: str) -> None:
-        """Raises: BadInputError: the hazard cannot be, and this run was named for it."""
+    def refuse(self, why: str) -> None:
+        """There is no room for the hazard. Raises: BadInputError: it names this run; else the run goes without it."""
         if self.hazard.run is not None:
             raise BadInputError(f"{self.what}: {why}")
 
@@ -37,7 +37,7 @@ class Strike:
         assert isinstance(hazard, Timed)
         for_s: float | None = getattr(hazard, "for_s", 0.0)
         if hazard.at_s is not None and hazard.at_s > duration_s:
-            self.is_void(f"at_s is {hazard.at_s:g}, and run {hazard.run} lasts {duration_s:.0f} s")
+            self.refuse(f"at_s is {hazard.at_s:g}, and run {hazard.run} lasts {duration_s:.0f} s")
         if for_s is None:
             return [(-np.inf if hazard.at_s is None else hazard.at_s, np.inf)]
         if hazard.at_s is not None:

@@ -103,6 +103,7 @@ def write_recording(
     reads = {tick: list(found) for tick, found in groupby(samples.readings, key=lambda reading: reading.tick)}
     names = [encoder.name for encoder in profile.encoders]
     scan_number = np.cumsum(samples.has_scan) - 1  # the server numbers what it sent, recorded or not
+    joint_number = np.cumsum(samples.has_joints) - 1
     with LogWriter(path, metadata, profile_toml) as log:
         for k in np.flatnonzero(samples.is_recorded).tolist():
             now_ns, begun_ns = int(tick_ns[k]), int(tick_ns[k] + lateness_ns[k])
@@ -123,7 +124,8 @@ def write_recording(
                     )
                 )
             if samples.has_joints[k]:
-                sent.append((topics.JOINT_STATES, joint_message(latched, names, samples.positions[k]), latched, k))
+                joints = joint_message(latched, names, samples.positions[k])
+                sent.append((topics.JOINT_STATES, joints, latched, int(joint_number[k])))
             sent.append((topics.TAGS, tags_message(now_ns, start_ns, reads.get(k, [])), now_ns, k))
             for topic, message, stamp_ns, sequence in sent:
                 log.write(topic.name, topic.msgtype, messages.encode(message), now_ns, stamp_ns, sequence)

@@ -279,12 +279,15 @@ class Shipped:
 
 SHIPPED = {
     "demo": Shipped(drifts_m=629, driven_m=902, tags=10, runs=2),
+    "dusty": Shipped(drifts_m=148, driven_m=330, tags=4, runs=2),
     "loop": Shipped(drifts_m=287, driven_m=580, tags=6, runs=1),
     "mine_level": Shipped(drifts_m=987, driven_m=2556, tags=13, runs=3),
     "missed_tag": Shipped(drifts_m=269, driven_m=628, tags=5, runs=2),
+    "slip": Shipped(drifts_m=161, driven_m=306, tags=5, runs=2),
     "straight": Shipped(drifts_m=416, driven_m=788, tags=2, runs=1),
     "tunnels": Shipped(drifts_m=3062, driven_m=7893, tags=28, runs=7),
     "two_drifts": Shipped(drifts_m=243, driven_m=569, tags=2, runs=2),
+    "vehicles": Shipped(drifts_m=211, driven_m=459, tags=5, runs=3),
 }
 
 
