@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MAX_GAP_POSES = 10  # a silence of 1 s at 0.1 s a tick, and
+MAX_GAP_POSES = 15  # a silence of 1.5 s at 0.1 s a tick, and
 MAX_GAP_M = 4.0  # of so many metres: a vehicle that stands still under a tag that answers now and then makes one pass
 THIN = 0.5  # of what its other clouds are long: a cloud that is read over less way is from elsewhere
 

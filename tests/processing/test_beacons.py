@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processing.beacons import Pass, find_passes, overlapping_passes
+from processing.beacons import Pass, find_passes, overlapping_passes, thin_passes
 
 A, B, C = "E2000000000000000000000A", "E2000000000000000000000B", "E2000000000000000000000C"
 
@@ -34,7 +34,7 @@ def test_the_centre_is_the_middle_of_the_index_range_not_of_the_reads() -> None:
 def test_the_range_is_half_a_chord_where_the_drive_turned() -> None:
     angle = np.linspace(0, np.pi, 21)
     poses = np.column_stack([5 * np.sin(angle), 5 * (1 - np.cos(angle)), angle])
-    [found] = passes_of({A: [0, 4, 20]}, poses)
+    [found] = passes_of({A: [0, 4, 12, 20]}, poses)
     assert found.range_m == pytest.approx(5.0)  # the way driven is 15.7 m
     assert (found.x, found.y) == pytest.approx((5.0, 5.0))
 
@@ -62,7 +62,7 @@ def test_a_short_silence_at_speed_is_one_pass() -> None:
     assert (found.first, found.last) == (10, 18)
 
 
-@pytest.mark.parametrize(("gap", "step_m", "clouds"), [(30, 0.2, 1), (31, 0.2, 2), (31, 0.129, 1), (31, 0.13, 2)])
+@pytest.mark.parametrize(("gap", "step_m", "clouds"), [(15, 0.3, 1), (16, 0.3, 2), (16, 0.249, 1), (16, 0.26, 2)])
 def test_a_cloud_ends_when_it_was_silent_for_both_ticks_and_metres(gap: int, step_m: float, clouds: int) -> None:
     assert len(passes_of({A: [10, 10 + gap]}, straight(100, step_m))) == clouds
 
@@ -79,13 +79,13 @@ def test_passes_come_in_driving_order_whatever_the_order_of_the_reads() -> None:
 
 
 def test_overlapping_clouds_are_both_kept_and_reported() -> None:
-    found = passes_of({A: [10, 20], B: [18, 40], C: [50, 60]}, straight(100))
+    found = passes_of({A: [10, 20], B: [18, 29, 40], C: [50, 60]}, straight(100))
     assert [p.epc for p in found] == [A, B, C]
     assert [(a.epc, b.epc) for a, b in overlapping_passes(found)] == [(A, B)]
 
 
 def test_overlaps_are_found_among_passes_that_are_no_neighbours() -> None:
-    wide = [0, 25, 50, 75, 100]
+    wide = [*range(0, 101, 10)]
     found = passes_of({A: wide, B: [55, 56], C: [90, 91]}, straight(120))
     assert [(a.epc, b.epc) for a, b in overlapping_passes(found)] == [(A, B), (A, C)]
 
@@ -110,3 +110,19 @@ def test_passes_that_crowd_push_no_more_than_they_must() -> None:
 
 def test_no_reads_no_passes() -> None:
     assert find_passes(np.array([], np.str_), np.array([], np.int64), straight(5)) == []
+
+
+def test_a_few_reads_from_elsewhere_are_thin_at_any_speed() -> None:
+    """Three reads far down the drift, beside a pass at a walk, one at full speed and one with a stop under the tag."""
+    walk, fast = straight(200, 0.1), straight(200, 1.0)
+    stop = straight(200, 0.2)
+    stop[50:120, 0] = stop[50, 0]
+    slow = passes_of({A: [*range(40, 80)], B: [20]}, walk)
+    quick = passes_of({A: [100, 101, 102, 103, 150, 151]}, fast)
+    stood = passes_of({A: [*range(40, 131)]}, stop)
+    thin = thin_passes([slow, quick, stood])
+    assert [[(found.epc, found.first) for found in of] for of in thin] == [[], [(A, 150)], []]
+
+
+def test_a_tag_that_was_read_once_is_never_thin() -> None:
+    assert thin_passes([passes_of({A: [5], B: [50, 51, 52]}, straight(100))]) == [[]]
