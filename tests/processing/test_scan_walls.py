@@ -133,7 +133,9 @@ def test_the_far_ends_of_two_walls_are_not_one_wall() -> None:
 def test_less_noise_makes_surer_walls() -> None:
     ranges = look(corridor(4.6), np.zeros(3), np.random.default_rng(5))
     points = points_of(ranges)
-    usual, surer = (prepare_scan(points, ANGLES[0], ANGLES[1] - ANGLES[0], *noise) for noise in ((), (0.003,)))
+    usual, surer = (
+        prepare_scan(points, ANGLES[0], ANGLES[1] - ANGLES[0], **noise) for noise in ({}, {"range_noise_m": 0.003})
+    )
     assert surer.range_noise_m == 0.003
     assert np.nanmin(surer.variances[:, 0]) < np.nanmin(usual.variances[:, 0])
     assert_array_equal(np.nanmin(usual.variances[:, 0]), usual.range_noise_m**2)
