@@ -61,6 +61,9 @@ class LaserDevice(Record, frozen=True):
 class Laser(Record, frozen=True):
     model: Literal["LMS111"] = "LMS111"
     mount: Mount = Mount()
+    blind_sectors_deg: tuple[tuple[float, float], ...] = ()  # in its frame, counter-clockwise; [170, -170] is 20° wide
+    min_range_m: float = 0.0  # what is nearer is the vehicle, or dirt on the window
+    range_noise_m: float = 0.012  # statistical error of an LMS111, data sheet
     device: LaserDevice | None = None
 
 
@@ -211,6 +214,9 @@ def _problems(profile: Profile) -> Iterator[str]:
         wanted = ROLES[vehicle.kinematics]
         if roles and sorted(roles) != sorted(wanted):
             yield f"{vehicle.kinematics} kinematics need one encoder in each role {' and '.join(wanted)}; found {roles}"
+    for which, laser in (("primary", profile.lasers.primary), ("auxiliary", profile.lasers.auxiliary)):
+        if laser is not None:
+            yield from _laser_problems(f"lasers.{which}", laser)
     names = [encoder.name for encoder in profile.encoders]
     if len(set(names)) != len(names):
         yield f"encoders share a name: {names}"
@@ -225,6 +231,20 @@ def _problems(profile: Profile) -> Iterator[str]:
         yield f"rfid.device.host is {reader.host!r} and serial_port {reader.serial_port!r}; it must be one of the two"
     if profile.encoder_bus is not None:
         yield from _bus_problems(profile.encoder_bus, profile.encoders)
+
+
+def _laser_problems(where: str, laser: Laser) -> Iterator[str]:
+    """What leaves a laser nothing to see, or cannot be a laser."""
+    for index, (start, end) in enumerate(laser.blind_sectors_deg):
+        if max(abs(start), abs(end)) > 360 or not 0 < (end - start) % 360 <= 270:
+            yield (
+                f"{where}.blind_sectors_deg[{index}] is [{start}, {end}]; it must run counter-clockwise from its first "
+                "angle to its second, over 270° at most"
+            )
+    if not 0 <= laser.min_range_m <= 5:
+        yield f"{where}.min_range_m is {laser.min_range_m}; it must lie in 0 … 5"
+    if not 0.001 <= laser.range_noise_m <= 0.2:
+        yield f"{where}.range_noise_m is {laser.range_noise_m}; it must lie in 0.001 … 0.2"
 
 
 def _bus_problems(bus: SeiBus | CanBus, encoders: list[Encoder]) -> Iterator[str]:

@@ -27,6 +27,7 @@ class Ranges:
     shape: tuple[int, int]  # (n, B)
     first: int = 0  # row of the file
     is_mirrored: bool = False  # the file holds the last beam first
+    left_out: tuple[tuple[int, int], ...] = ()  # beams, from one to before another, that are given back as NaN
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -51,6 +52,8 @@ class Ranges:
         except OSError as error:
             raise RTLogError(f"{self.path}: was lost while it was in use: {error.strerror or error}") from error
         found = found[:, ::-1] if self.is_mirrored else found
+        for start, end in self.left_out:
+            found[:, start:end] = np.nan
         return found if np.ndim(rows) else found[0]
 
     def mirrored(self) -> "Ranges":

@@ -120,7 +120,8 @@ def read_window(window: Window, scratch: Path) -> Readings:
     reads: list[tuple[int, str]] = []
     motion_of = _wheels_of(source.profile) if source.has_wheels else _pose_of
     tick_log_times: list[int] = []
-    with ScanReader(scratch / f"{source.info.run_id}.{window.number}.ranges") as scans:
+    ranges = scratch / f"{source.info.run_id}.{window.number}.ranges"
+    with ScanReader(ranges, source.profile.lasers.primary) as scans:
         for topic, log_time_ns, message in _decoded(
             window, [TICK.name, source.scan_topic, source.encoder_topic, TAGS.name]
         ):
@@ -158,7 +159,8 @@ def join_windows(source: Source, windows: Sequence[Readings], scratch: Path) -> 
     if not len(motion_ns):
         roles = [encoder.name for encoder in profile.encoders]
         raise BadInputError(f"{path}: no message on {source.encoder_topic} holds a reading of {' and '.join(roles)}")
-    scans = join_scans(path, [window.scans for window in windows], scratch / f"{source.info.run_id}.ranges")
+    read = [window.scans for window in windows]
+    scans = join_scans(path, read, profile.lasers.primary, scratch / f"{source.info.run_id}.ranges")
     rising_motion_ns, rising_scan_ns = rising_stamps(motion_ns), rising_stamps(scans.stamps_ns)
     if rising_motion_ns[0] > rising_scan_ns[-1] or rising_scan_ns[0] > rising_motion_ns[-1]:
         what = f"{source.scan_topic} and {source.encoder_topic} have no time in common"

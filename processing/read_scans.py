@@ -4,7 +4,7 @@ In: the messages in the order of the recording. Out: ranges as they were measure
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,11 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.errors import BadInputError
+from hw_profiles.profile import Laser
+from processing.own_parts import OwnPart, find_own_parts
 from processing.range_file import RangeFile, Ranges, join_ranges
 from rtlog_server.messages import to_ns
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+
+EDGE_DEG = 1e-3  # a beam on the edge of a blind sector, as its angle is rounded, is blind
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,8 @@ class Scans:
     angle_min: float
     angle_increment: float
     time_increment_s: float  # between two beams of a sweep
+    range_noise_m: float = Laser().range_noise_m
+    own_parts: tuple[OwnPart, ...] = ()  # beams that saw the vehicle itself; their ranges are NaN
 
     @property
     def angles(self) -> Array:
@@ -50,7 +56,8 @@ class ReadScans:
 class ScanReader:
     """Takes the scans of a stretch as they come; their ranges go to the file `scratch`."""
 
-    def __init__(self, scratch: Path) -> None:
+    def __init__(self, scratch: Path, laser: Laser) -> None:
+        self._laser = laser
         self._file = RangeFile(scratch)
         self._stamps_ns: list[int] = []
         self._log_times_ns: list[int] = []
@@ -60,11 +67,14 @@ class ScanReader:
         ranges = np.array(message.ranges, np.float32)
         if message.range_max > 0:
             ranges[ranges >= message.range_max] = np.inf
-        ranges[(ranges <= 0) | (ranges < message.range_min)] = np.nan  # nearer than can be measured
+        ranges[(ranges <= 0) | (ranges < max(message.range_min, self._laser.min_range_m))] = np.nan
+        start, increment = float(message.angle_min), float(message.angle_increment)
+        if self._laser.blind_sectors_deg:
+            angles = start + increment * np.arange(len(ranges), dtype=np.float64)
+            ranges[in_sectors(angles, self._laser.blind_sectors_deg)] = np.nan
         self._file.append(ranges)
         self._stamps_ns.append(to_ns(message.header.stamp))
         self._log_times_ns.append(log_time_ns)
-        start, increment = float(message.angle_min), float(message.angle_increment)
         self._settings[round(increment, 7), round(start, 5)] = start, increment, float(message.time_increment)
 
     def finish(self) -> ReadScans:
@@ -81,7 +91,15 @@ class ScanReader:
         self._file.close()
 
 
-def join_scans(recording: Path, parts: Sequence[ReadScans], scratch: Path) -> Scans:
+def in_sectors(angles: Array, sectors_deg: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Which angles (B,) [rad] lie in one of the sectors [deg], each counter-clockwise from its first to its second."""
+    inside = np.zeros(len(angles), np.bool_)
+    for start, end in sectors_deg:
+        inside |= (np.degrees(angles) - start + EDGE_DEG) % 360 <= (end - start) % 360 + 2 * EDGE_DEG
+    return inside
+
+
+def join_scans(recording: Path, parts: Sequence[ReadScans], laser: Laser, scratch: Path) -> Scans:
     """The scans of all stretches, their ranges in the one file `scratch`; their times are still to be found.
 
     Raises:
@@ -106,4 +124,8 @@ def join_scans(recording: Path, parts: Sequence[ReadScans], scratch: Path) -> Sc
         start, increment, time_increment = start + increment * (beams - 1), -increment, -time_increment
         ranges = ranges.mirrored()
     stamps_ns = np.concatenate([part.stamps_ns for part in parts])
-    return Scans(stamps_ns, np.empty(len(stamps_ns)), ranges, start, increment, time_increment)
+    times = np.empty(len(stamps_ns))
+    scans = Scans(stamps_ns, times, ranges, start, increment, time_increment, laser.range_noise_m)
+    own_parts = find_own_parts(ranges, scans.angles)
+    left_out = tuple((part.first, part.end) for part in own_parts)
+    return replace(scans, ranges=replace(ranges, left_out=left_out), own_parts=tuple(own_parts))

@@ -21,6 +21,7 @@ def remarks(runs: list["DrivenRun"], placed: Placement) -> list[str]:
     out = []
     for driven in runs:
         name = driven.run.run_id
+        out += [f"run {name}: beams at {part}; they are left out" for part in driven.run.scans.own_parts]
         for found in driven.passes:
             if not found.read:
                 tick = int(driven.run.scan_ticks[found.centre])

@@ -13,12 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hw_profiles.profile import Laser
 from processing.solid_returns import solid_returns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-RANGE_NOISE_M = 0.012  # statistical error of an LMS111, data sheet
+RANGE_NOISE_M = Laser().range_noise_m
 WALL_LENGTH_M = 0.35  # a normal is fitted to at least this much wall, where there are enough points
 MAX_NEIGHBOURS = 12
 SMOOTH_M = 2.0  # a wall this far straight, to as much as noise lets one see, is smooth
@@ -177,14 +178,14 @@ def _fit_walls(
 
 
 def prepare_scan(
-    points: Array,
+    points: NDArray[np.floating],
     angle_min: float,
     angle_increment: float,
     mount: Array = AT_ORIGIN,
     range_noise_m: float = RANGE_NOISE_M,
 ) -> Scan:
     """Fit the walls of a scan. `points` (B, 2) in the scanner's frame, NaN where there is no return."""
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    normals, variances = np.empty_like(points), np.empty_like(points)
-    bent_rad = _fit_walls(points, angle_min, angle_increment, range_noise_m, normals, variances)
-    return Scan(points, normals, variances, angle_min, angle_increment, bent_rad, mount, range_noise_m)
+    placed: Array = np.ascontiguousarray(points, dtype=np.float64)
+    normals, variances = np.empty_like(placed), np.empty_like(placed)
+    bent_rad = _fit_walls(placed, angle_min, angle_increment, range_noise_m, normals, variances)
+    return Scan(placed, normals, variances, angle_min, angle_increment, bent_rad, mount, range_noise_m)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.odometry import Motions
 from processing.range_file import Ranges
 from processing.read_scans import Scans
-from processing.scan_walls import Scan, prepare_scan
+from processing.scan_walls import RANGE_NOISE_M, Scan, prepare_scan
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,6 +37,7 @@ class Sweeps:
     angle_min: float
     angle_increment: float
     time_increment_s: float  # between two beams
+    range_noise_m: float = RANGE_NOISE_M
 
     def __len__(self) -> int:
         return len(self.velocities)
@@ -64,13 +65,16 @@ class Sweeps:
 
     def scan(self, row: int) -> Scan:
         """Ready for matching."""
-        return prepare_scan(self.points(slice(row, row + 1))[0], self.angle_min, self.angle_increment, self.mount)
+        return self._prepare(self.points(slice(row, row + 1))[0])
 
     def scans(self, rows: Ints) -> Iterator[Scan]:
         """The same, of many."""
         for start in range(0, len(rows), AT_ONCE):
             for points in self.points(rows[start : start + AT_ONCE]):
-                yield prepare_scan(points, self.angle_min, self.angle_increment, self.mount)
+                yield self._prepare(points)
+
+    def _prepare(self, points: Points) -> Scan:
+        return prepare_scan(points, self.angle_min, self.angle_increment, self.mount, self.range_noise_m)
 
     def cut(self, first: int, last: int) -> "Sweeps":
         """Sweeps `first` to `last`, the last included."""
@@ -82,9 +86,8 @@ class Sweeps:
 def sweeps_of(scans: Scans, odometry: Motions, mount: Array) -> Sweeps:
     """The sweeps of a run; `odometry` (n - 1) between them."""
     velocities = velocities_of(odometry.deltas, scans.times)
-    return Sweeps(
-        scans.ranges, scans.times, velocities, mount, scans.angle_min, scans.angle_increment, scans.time_increment_s
-    )
+    angles = scans.angle_min, scans.angle_increment
+    return Sweeps(scans.ranges, scans.times, velocities, mount, *angles, scans.time_increment_s, scans.range_noise_m)
 
 
 def velocities_of(motions: Array, times: Array) -> Array:

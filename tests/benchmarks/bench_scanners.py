@@ -46,9 +46,22 @@ def half_a_circle(_: int, scan: Any, __: np.random.Generator) -> Any:
     )
 
 
-def dust(_: int, scan: Any, rng: np.random.Generator) -> Any:
-    grains = np.where(rng.random(len(scan.ranges)) < 0.05, rng.uniform(0.3, 6.0, len(scan.ranges)), np.inf)
-    return replace(scan, ranges=np.minimum(scan.ranges, grains).astype(np.float32))
+def dust(k: int, scan: Any, rng: np.random.Generator) -> Any:
+    share = 0.6 if 1200 <= k < 1400 else 0.15
+    grains = rng.uniform(0.3, np.minimum(scan.ranges, scan.range_max))
+    return replace(scan, ranges=np.where(rng.random(len(grains)) < share, grains, scan.ranges).astype(np.float32))
+
+
+def dark_rock(_: int, scan: Any, rng: np.random.Generator) -> Any:
+    lost = rng.random(len(scan.ranges)) < 0.5
+    return replace(scan, ranges=np.where(lost, np.inf, scan.ranges).astype(np.float32))
+
+
+def plate(_: int, scan: Any, rng: np.random.Generator) -> Any:
+    """A part of the vehicle, 1.5 m off in 30° of the view."""
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+    ranges = 1.5 / np.cos(angles) + rng.normal(0, 0.004, len(angles))
+    return replace(scan, ranges=np.where(np.abs(np.degrees(angles)) < 15, ranges, scan.ranges).astype(np.float32))
 
 
 def someone_beside(k: int, scan: Any, rng: np.random.Generator) -> Any:
@@ -77,7 +90,9 @@ CHANGES: dict[str, Change] = {
     "181 beams": fewer_beams,
     "180°, 361 beams": half_a_circle,
     "5 Hz": every_other,
-    "dust: 5 % of the beams end on nothing": dust,
+    "dust: 15 % of the beams end on nothing, 60 % for 20 s": dust,
+    "dark rock: half of the beams have no return": dark_rock,
+    "a plate of the vehicle in 30° of the view": plate,
     "someone walks beside": someone_beside,
     "stamps that jitter by 4 ms": jittered_stamps,
 }

@@ -1,6 +1,7 @@
 """Ranges in a scratch file: what was written comes back, whatever rows are asked for."""
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,16 @@ def test_rows_come_back_by_any_index(tmp_path: Path, is_mirrored: bool) -> None:
         assert_array_equal(ranges[which], expected[which])
     with pytest.raises(IndexError):
         ranges[12]
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_beams_that_are_left_out_come_back_as_nothing(tmp_path: Path, is_mirrored: bool) -> None:
+    ranges = replace(write(tmp_path / "a", [30] * 12, is_mirrored), left_out=((0, 2), (7, 11)))
+    expected = (ROWS[:, ::-1] if is_mirrored else ROWS).copy()
+    expected[:, [0, 1, 7, 8, 9, 10]] = np.nan
+    assert_array_equal(ranges[:], expected)
+    assert_array_equal(ranges[3], expected[3])
+    assert_array_equal(ranges.cut(4, 6)[np.array([2, 0])], expected[[6, 4]])
 
 
 def test_short_scans_are_padded_before_and_after_a_longer_one(tmp_path: Path) -> None:

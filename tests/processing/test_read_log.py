@@ -136,6 +136,34 @@ def test_returns_beyond_reach_or_below_it_are_no_walls(record: Record) -> None:
     assert_array_equal(read, np.float32([np.inf, np.inf, np.inf, *[np.nan] * 5, 5.0]))
 
 
+def test_blind_sectors_and_what_is_too_near_say_nothing(record: Record) -> None:
+    keys = (
+        "[lasers.primary]\nblind_sectors_deg = [[80.0, 110.0], [-135, -130]]\nmin_range_m = 0.6\nrange_noise_m = 0.02"
+    )
+    ranges = np.full(541, 5.0)
+    ranges[[100, 101]] = 0.59, 0.61
+    messages = drive(ours, but=lambda topic, _: "scan" in topic)
+    messages += [("/laser/primary/scan", tick_ns(k), scan(tick_ns(k), ranges)) for k in range(TICKS)]
+    scans = read_log(record(messages, TRAILER.replace("[lasers.primary]", keys))).scans
+    degrees = np.round(np.degrees(scans.angles), 3)
+    blind = ((degrees >= 80) & (degrees <= 110)) | (degrees <= -130)
+    blind[100] = True
+    assert_array_equal(np.isnan(scans.ranges), np.tile(blind, (TICKS, 1)))
+    assert scans.range_noise_m == 0.02
+
+
+@pytest.mark.parametrize("turn", [1, -1], ids=["counter-clockwise", "clockwise"])
+def test_a_blind_sector_may_pass_half_a_turn(record: Record, turn: int) -> None:
+    profile = parse_profile('schema = 1\nname = "a"\n[lasers.primary]\nblind_sectors_deg = [[170, -170]]', "a test")
+    messages = drive(theirs, but=lambda topic, _: topic == "/scan")
+    angles = (-np.pi * turn, np.radians(turn))
+    messages += [("/scan", tick_ns(k), scan(tick_ns(k), np.full(360, 3.0), angles)) for k in range(TICKS)]
+    scans = read_log(record(messages), profile).scans
+    degrees = np.degrees(scans.angles)
+    assert_array_equal(np.isnan(scans.ranges[0]), np.round(np.cos(np.radians(degrees)), 6) <= -0.984808)
+    assert np.isnan(scans.ranges[0]).sum() == 21
+
+
 def test_shorter_scans_are_padded_with_nothing(record: Record) -> None:
     messages = drive(ours)
     short = scan(tick_ns(0) - 30_000_000, np.full(500, 2.0))
