@@ -39,8 +39,11 @@ HONEST = 3.0  # standard deviations that wheels may be off without being at faul
 OPEN = 100.0  # of what the two witnesses differ by, squared: the doubt of a match that may as well be moved so far
 OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict them
 NEUTRAL = 0.005  # smooth walls, which fit there as well, differ by less
+ASKEW_RAD = 0.05  # what moves along with the vehicle does not turn a match; one as far turned saw other walls
 HALF_TRACK_M = 0.8  # of a vehicle of this kind
 SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
+PAUSE_S = 1.0  # a single match after a longer one convicts nobody: where the vehicle went meanwhile, wheels know best
+LONG_S = 0.3  # of a pause so long the motion before says as much as it ever will
 STEP_M, STEP_RAD = 0.05, 0.03  # what a match and a stamp may be off, besides
 AWRY = (0.3, 0.3, 0.2)  # m, m, rad: what convicted wheels may be off in one step, where the walls show nothing
 SLIPPED = (0.05, 0.05, 0.02)  # m, m, rad: and where they do
@@ -96,27 +99,37 @@ class Chain:
         self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))
         self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))
 
-    def advance(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float, search: bool) -> bool:
+    def advance(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float) -> bool:
         """Match scan `k`, one odometry `step` and `seconds` after the last; False leaves all as it was."""
         wheels = Motion(*carry(self.driven, self.driven_covariance, step, noise))
-        result = self._match(scan, join(self.offset, step), search)
+        result = self._match(scan, join(self.offset, step))
         if _is_good(result):
             walls = self._motion_of(result)
             agrees, *fused = fuse(wheels.pose, wheels.covariance, 1.0, walls.pose, walls.covariance)
             if agrees:
-                if search:  # what had to be searched for may be elsewhere
-                    fused[1] = GATE * wheels.covariance
                 self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
                 return True
         onward = self._onward(step, seconds)
-        tried = [result] if self.velocity is None else [result, self._match(scan, join(self.offset, onward), search)]
+        tried = [result] if self.velocity is None else [result, self._match(scan, join(self.offset, onward))]
         good = [of for of in tried if _is_good(of)]
         if not good:
             return False
         possible = [of for of in good if self._is_possible(of, onward, seconds)]
         best = max(possible or good, key=agreement)
-        self._judge(k, scan, best, bool(possible), wheels, step, onward, seconds)
-        return True
+        return self._judge(k, scan, best, bool(possible), wheels, step, onward, seconds)
+
+    def find(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float) -> bool:
+        """The same by a search around where the wheels say; what had to be searched for convicts nobody."""
+        wheels = Motion(*carry(self.driven, self.driven_covariance, step, noise))
+        at = to_laser(self.mount, self.mount, join(self.offset, step))
+        result = search_match(self.scan, scan, at, SEARCH_M, SEARCH_RAD)
+        if not _is_good(result):
+            return False
+        walls = self._motion_of(result)
+        agrees, fused, _ = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
+        if agrees:  # but it may be elsewhere
+            self._arrive(k, Motion(fused, GATE * wheels.covariance), wheels, result.overlap, seconds)
+        return agrees
 
     def _judge(
         self,
@@ -128,8 +141,8 @@ class Chain:
         step: Array,
         onward: Array,
         seconds: float,
-    ) -> None:
-        """The wheels contradict a match, or led to none: who of the two is right?"""
+    ) -> bool:
+        """The wheels contradict a match, or led to none: who of the two is right? False: it is no match at all."""
         walls = self._motion_of(result)
         # what the walls leave open they do not quarrel about
         ample = GATE * wheels.covariance + np.diag(np.square(SLIPPED))
@@ -142,6 +155,8 @@ class Chain:
         within, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
         if np.allclose(honest, missed) or (within and NEUTRAL <= against < OBJECTS):
             self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
+        elif (against < OBJECTS and abs(missed[2]) > ASKEW_RAD) or (not within and seconds > PAUSE_S):
+            return False
         elif against < OBJECTS:
             unsure = walls.covariance + OPEN * np.outer(missed, missed)
             _, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, unsure)
@@ -160,17 +175,15 @@ class Chain:
             self._arrive(k, Motion(*fused), Motion(fused[0], slipped), result.overlap, seconds)
         if not within:
             self.contradictions.append(Contradiction(k, against >= OBJECTS, missed))
+        return True
 
     def coast(self, k: int, step: Array, noise: Array, seconds: float) -> None:
         """Take odometry's word for scan `k`."""
         fused = Motion(*carry(self.offset, self.covariance, step, GATE * noise))
         self._arrive(k, fused, Motion(*carry(self.driven, self.driven_covariance, step, noise)), 0.0, seconds)
 
-    def _match(self, scan: Scan, guess: Array, search: bool) -> ScanMatch:
-        at = to_laser(self.mount, self.mount, guess)
-        if search:
-            return search_match(self.scan, scan, at, SEARCH_M, SEARCH_RAD)
-        return self.match(self.scan, scan, at)
+    def _match(self, scan: Scan, guess: Array) -> ScanMatch:
+        return self.match(self.scan, scan, to_laser(self.mount, self.mount, guess))
 
     def _motion_of(self, result: ScanMatch) -> Motion:
         return Motion(*to_vehicle(self.mount, self.mount, result.motion, result.covariance))
@@ -183,7 +196,9 @@ class Chain:
         """Could the vehicle have got there from its motion so far, as far as the walls see?"""
         if self.velocity is None:
             return True
-        far, turned = SPEED_UP_M_S2 * seconds**2 + STEP_M, TURN_UP_RAD_S2 * seconds**2 + STEP_RAD
+        far, turned = (
+            np.array([SPEED_UP_M_S2, TURN_UP_RAD_S2]) * min(seconds, LONG_S) ** 2 + (STEP_M, STEP_RAD)
+        ).tolist()
         reach = self.covariance + np.diag([far**2, far**2, turned**2]) / CHI_SQUARED_3_999
         walls = self._motion_of(result)
         return fuse(join(self.offset, onward), reach, 1.0, walls.pose, walls.covariance)[0]

@@ -157,12 +157,10 @@ def _drive(segment: Segment, match: Matcher) -> DrivenSegment:
     chain.add_keyframe(0, before)
     for k, current in enumerate(scans, start=1):
         driven = odometry.deltas[k - 1], odometry.covariances[k - 1], float(seconds[k - 1])
-        if not chain.advance(k, current, *driven, search=False):
+        if not chain.advance(k, current, *driven):
             if chain.keyframes[-1] != k - 1:  # too little in common with the key frame; more with the scan before
                 chain.add_keyframe(k - 1, before)
-            if not (
-                chain.advance(k, current, *driven, search=False) or chain.advance(k, current, *driven, search=True)
-            ):
+            if not (chain.advance(k, current, *driven) or chain.find(k, current, *driven)):
                 chain.coast(k, *driven)
         if chain.wants_keyframe or k in segment.cuts:
             chain.add_keyframe(k, current)
