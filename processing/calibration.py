@@ -21,6 +21,7 @@ from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.scan_matching import match_scans
+from processing.sensor_calibration import LaserPairs
 from processing.sweeps import Sweeps, sweeps_of
 from processing.turn_calibration import WheelTurn, fit_turn, put_right
 
@@ -92,6 +93,7 @@ def _with_noise(profile: Profile, noise_m_per_sqrt_m: float) -> Profile:
 class Strides:
     """Pairs of scans to compare, k of them; a stretch of the run's sweeps is all that is needed for it."""
 
+    first: int  # of the run's scans
     sweeps: Sweeps
     ends: Ints  # (k, 2) sweeps of the stretch
     counted: Array  # (k, 3) motions of the vehicle by its wheels
@@ -111,31 +113,37 @@ def cut_strides(run: Run) -> list[Strides]:
     for k in range(0, len(ends), COMPARED_AT_ONCE):
         some = ends[k : k + COMPARED_AT_ONCE]
         first, last = int(some.min()), int(some.max())
-        stretches.append(Strides(sweeps.cut(first, last), some - first, counted[k : k + COMPARED_AT_ONCE]))
+        stretches.append(Strides(first, sweeps.cut(first, last), some - first, counted[k : k + COMPARED_AT_ONCE]))
     return stretches
 
 
-def compare_strides(strides: Strides) -> Pairs:
+def compare_strides(strides: Strides) -> LaserPairs:
     """What scan matches see of the motions: of those pairs that match."""
     mount, matched, seen, covariances = strides.sweeps.mount, [], [], []
     for k, (first, last) in enumerate(strides.ends.tolist()):
         one, other = strides.sweeps.scan(first), strides.sweeps.scan(last)
         match = match_scans(one, other, compose(inverse(mount), compose(strides.counted[k], mount)))
-        motion, covariance = through_mount(mount, match.motion, match.covariance)
         if match.converged and match.inliers >= MIN_INLIERS:
             matched.append(k)
-            seen.append(motion)
-            covariances.append(covariance)
-    counted = strides.counted[np.array(matched, np.int64)]
-    return Pairs(counted, np.array(seen).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))
+            seen.append(match.motion)
+            covariances.append(match.covariance)
+    ends = strides.first + strides.ends[np.array(matched, np.int64)]
+    return LaserPairs(ends, np.array(seen).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3))
 
 
-def join_pairs(parts: Sequence[Pairs]) -> Pairs:
-    return Pairs(
-        np.concatenate([np.zeros((0, 3)), *(part.counted for part in parts)]),
-        np.concatenate([np.zeros((0, 3)), *(part.seen for part in parts)]),
+def join_pairs(parts: Sequence[LaserPairs]) -> LaserPairs:
+    return LaserPairs(
+        np.concatenate([np.zeros((0, 2), np.int64), *(part.ends for part in parts)]),
+        np.concatenate([np.zeros((0, 3)), *(part.motions for part in parts)]),
         np.concatenate([np.zeros((0, 3, 3)), *(part.covariances for part in parts)]),
     )
+
+
+def pairs_of(run: Run, pairs: LaserPairs) -> Pairs:
+    """The same as motions of the vehicle, beside what its wheels count."""
+    driven = accumulate(np.zeros(3), odometry_at_scans(run).deltas)
+    counted = relative(driven[pairs.ends[:, 0]], driven[pairs.ends[:, 1]])
+    return Pairs(counted, *through_mount(mount_pose(run), pairs.motions, pairs.covariances))
 
 
 def scale_of(pairs: Pairs) -> WheelScale:

@@ -25,7 +25,10 @@ TOGETHER_S = 2.0  # a pause between contradictions that is shorter belongs to th
 def convictions(driven: "DrivenRun") -> list[dict[str, Any]]:
     """Those of a run, in order."""
     times, ticks, poses = driven.run.scans.times, driven.run.scan_ticks, driven.loop.poses
-    out = []
+    whole = [int(ticks[0]), int(ticks[-1])]
+    out: list[dict[str, Any]] = [
+        {"run": driven.run.run_id, "ticks": whole, "what": "profile", "how_much": line} for line in driven.put_right
+    ]
     for convicts_wheels in (True, False):
         found = [of for of in driven.loop.contradictions if of.convicts_wheels == convicts_wheels]
         cuts = [k for k, (a, b) in enumerate(pairwise(found), 1) if times[b.scan] - times[a.scan] > TOGETHER_S]

@@ -60,6 +60,7 @@ MATCHERS: dict[str, Matcher] = {"point-to-line": match_scans, "psm": match_polar
 class DrivenRun:
     run: Run
     wheels: WheelScale
+    put_right: list[str]  # what its profile or its stamps said wrongly
     loop: OpenLoop
     passes: list[Pass]
 
@@ -113,7 +114,7 @@ def drive_through(runs: list[ReadyRun], work: Workers, match: Matcher) -> list[D
         [cut_segments(of.sweeps, of.odometry, np.array([p.centre for p in of.passes], np.int64)) for of in runs],
     )
     return [
-        DrivenRun(of.run, of.wheels, join_segments(of.sweeps, of.odometry, segments), of.passes)
+        DrivenRun(of.run, of.wheels, of.put_right, join_segments(of.sweeps, of.odometry, segments), of.passes)
         for of, segments in zip(runs, driven, strict=True)
     ]
 

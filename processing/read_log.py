@@ -56,6 +56,8 @@ class Run:
     odometry: Array | None  # (m, 3) poses of /odom, where that stands in for encoders
     tags: TagReadings
     ticks: int
+    stamped: tuple[Array, Array] | None = None  # (n,) and (m,) s: what the stamps of scans and odometry say, where the
+    # times were put right
 
 
 @dataclass(frozen=True, slots=True)

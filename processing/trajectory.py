@@ -45,10 +45,17 @@ def run_trajectory(run: Run, loop: OpenLoop, keyframes: Array) -> tuple[NDArray[
     moved = travelled(driven, run.motion_times)
     moved_at_scans = np.interp(run.scans.times, run.motion_times, moved)
     between = np.append(np.maximum(np.diff(moved_at_scans), 1e-9), np.inf)
-    k = np.maximum(np.searchsorted(run.scans.times, run.motion_times, side="right") - 1, 0)
-    share = np.maximum(moved - moved_at_scans[k], 0.0) / between[k]
-    after = compose(at_scans[k], relative(blind[k], driven))
-    poses = np.concatenate([at_scans, compose(after, missed[k] * share[:, None])])
+
+    def poses_at(times: Array) -> Array:
+        k = np.maximum(np.searchsorted(run.scans.times, times, side="right") - 1, 0)
+        share = np.maximum(np.interp(times, run.motion_times, moved) - moved_at_scans[k], 0.0) / between[k]
+        after = compose(at_scans[k], relative(blind[k], interpolate_poses(run.motion_times, driven, times)))
+        return compose(after, missed[k] * share[:, None])
+
+    if run.stamped is None:
+        poses = np.concatenate([at_scans, poses_at(run.motion_times)])
+    else:  # a pose at a stamp is where the vehicle was by that clock, not where it was when a late scan was taken
+        poses = np.concatenate([poses_at(run.stamped[0]), poses_at(run.stamped[1])])
     stamps = np.concatenate([run.scans.stamps_ns, run.motion_ns])
     stamps, first = np.unique(stamps, return_index=True)
     return stamps, poses[first]

@@ -17,12 +17,15 @@ from processing.calibration import (
     scale_of,
     stride_pairs,
 )
+from processing.calibration import (
+    pairs_of as as_motions,
+)
 from processing.pipeline import DrivenRun
 from processing.read_log import Run
 
 
 def pairs_of(run: Run) -> Pairs:
-    return join_pairs([compare_strides(strides) for strides in cut_strides(run)])
+    return as_motions(run, join_pairs([compare_strides(strides) for strides in cut_strides(run)]))
 
 
 def test_the_small_mine_shows_that_its_wheels_count_too_little(driven: list[DrivenRun]) -> None:

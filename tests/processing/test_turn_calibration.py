@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hw_profiles.profile import load_profile
-from processing.calibration import compare_strides, cut_strides, join_pairs, turn_of
+from processing.calibration import compare_strides, cut_strides, join_pairs, pairs_of, turn_of
 from processing.odometry import wheel_steps
 from processing.pipeline import DrivenRun
 from processing.turn_calibration import PRIOR_BIAS_PER_M, PRIOR_SCALE, WheelTurn, fit_turn, put_right
@@ -46,7 +46,7 @@ def test_wheels_put_right_count_the_true_way_and_turn(name: str) -> None:
 
 def test_a_calibrated_run_turns_as_its_matches_see_it(driven: list[DrivenRun]) -> None:
     for of in driven:  # its world has wheels of unequal radius: 1.2 mrad a metre
-        left = turn_of(join_pairs([compare_strides(strides) for strides in cut_strides(of.run)]))
+        left = turn_of(pairs_of(of.run, join_pairs([compare_strides(strides) for strides in cut_strides(of.run)])))
         sigmas = np.sqrt(np.diag(left.covariance))
         assert abs(left.bias_per_m) < max(3 * sigmas[1], 1e-4)
         assert abs(left.scale - 1) < max(3 * sigmas[0], 1e-3)
