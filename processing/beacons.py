@@ -24,6 +24,7 @@ Ints = NDArray[np.int64]
 MAX_GAP_POSES = 15  # a silence of 1.5 s at 0.1 s a tick, and
 MAX_GAP_M = 4.0  # of so many metres: a vehicle that stands still under a tag that answers now and then makes one pass
 THIN = 0.5  # of what its other clouds are long: a cloud that is read over less way is from elsewhere
+THINNEST = 0.2  # of what the clouds of all tags are long
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +84,10 @@ def thin_passes(runs: Sequence[Sequence[Pass]]) -> list[list[Pass]]:
     lengths_m: dict[str, list[float]] = defaultdict(list)
     for found in (found for passes in runs for found in passes):
         lengths_m[found.epc].append(found.read_m)
+    every_m = [length_m for of in lengths_m.values() for length_m in of]
+    least_m = THINNEST * float(np.median(every_m)) if every_m else 0.0  # a tag beyond the rock may have no pass at all
     usual_m = {epc: float(np.quantile(of, 0.75)) for epc, of in lengths_m.items()}
-    return [[found for found in passes if found.read_m < THIN * usual_m[found.epc]] for passes in runs]
+    return [[found for found in passes if found.read_m < max(THIN * usual_m[found.epc], least_m)] for passes in runs]
 
 
 def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:

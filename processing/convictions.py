@@ -29,6 +29,11 @@ def convictions(driven: "DrivenRun") -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = [
         {"run": driven.run.run_id, "ticks": whole, "what": "profile", "how_much": line} for line in driven.put_right
     ]
+    guessed = driven.loop.odometry.guessed
+    for k in np.flatnonzero(guessed).tolist() if guessed is not None else []:
+        ends = [int(ticks[k]), int(ticks[k + 1])]
+        how_much = f"a step that no vehicle makes, within {times[k + 1] - times[k]:.1f} s"
+        out.append({"run": driven.run.run_id, "ticks": ends, "what": "wheels", "how_much": how_much})
     for convicts_wheels in (True, False):
         found = [of for of in driven.loop.contradictions if of.convicts_wheels == convicts_wheels]
         cuts = [k for k, (a, b) in enumerate(pairwise(found), 1) if times[b.scan] - times[a.scan] > TOGETHER_S]
