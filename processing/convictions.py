@@ -29,11 +29,7 @@ def convictions(driven: "DrivenRun") -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = [
         {"run": driven.run.run_id, "ticks": whole, "what": "profile", "how_much": line} for line in driven.put_right
     ]
-    guessed = driven.loop.odometry.guessed
-    for k in np.flatnonzero(guessed).tolist() if guessed is not None else []:
-        ends = [int(ticks[k]), int(ticks[k + 1])]
-        how_much = f"a step that no vehicle makes, within {times[k + 1] - times[k]:.1f} s"
-        out.append({"run": driven.run.run_id, "ticks": ends, "what": "wheels", "how_much": how_much})
+    out += [_tell_skid(driven, int(a), int(b)) for a, b in _stretches_of(driven.loop.odometry.guessed)]
     for convicts_wheels in (True, False):
         found = [of for of in driven.loop.contradictions if of.convicts_wheels == convicts_wheels]
         cuts = [k for k, (a, b) in enumerate(pairwise(found), 1) if times[b.scan] - times[a.scan] > TOGETHER_S]
@@ -66,3 +62,22 @@ def _tell_scans(stretch: Sequence[Contradiction]) -> str:
     missed = np.array([of.missed for of in stretch])
     metres, degrees = np.hypot(missed[:, 0], missed[:, 1]).max(), np.degrees(np.abs(missed[:, 2]).max())
     return f"{len(stretch)} scans up to {metres:.2f} m and {degrees:.1f}° off the wheels"
+
+
+def _stretches_of(marked: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+    """Where each begins, and one past its end (k, 2)."""
+    if marked is None:
+        return np.zeros((0, 2), np.int64)
+    return np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]))).reshape(-1, 2)
+
+
+def _tell_skid(driven: "DrivenRun", first: int, end: int) -> dict[str, Any]:
+    """Motions from `first` to before `end` are none that a vehicle makes."""
+    ticks, times = driven.run.scan_ticks, driven.run.scans.times
+    how_much = f"motions that no vehicle makes within {times[end] - times[first]:.1f} s"
+    return {
+        "run": driven.run.run_id,
+        "ticks": [int(ticks[first]), int(ticks[end])],
+        "what": "wheels",
+        "how_much": how_much,
+    }

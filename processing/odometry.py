@@ -25,10 +25,6 @@ Array = NDArray[np.float64]
 # What a vehicle that stands still may still have moved: below the resolution of any wheel encoder.
 STANDING_M = 1e-4
 STANDING_RAD = 2e-5
-# What no vehicle does, and in one step; and what is known of a step that was guessed.
-MAX_M_S, MAX_RAD_S = 20.0, 5.0
-LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 1.0
-GUESSED = (0.5, 0.2, 0.2)  # m, m, rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,23 +70,6 @@ def odom_motions(poses: Array, noise: OdometryNoise) -> Motions:
     along = np.cos(half) * deltas[:, 0] + np.sin(half) * deltas[:, 1]
     across = -np.sin(half) * deltas[:, 0] + np.cos(half) * deltas[:, 1]
     return _motions(np.column_stack([along / np.sinc(half / np.pi), deltas[:, 2], across]), noise)
-
-
-def without_impossible(motions: Motions, seconds: Array) -> Motions:
-    """The motions over so many `seconds` (n,), with what no vehicle does replaced by the motion before, in ample doubt:
-    where a count or a pose starts anew or jumps.
-    """
-    seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
-    metres, radians = np.hypot(motions.deltas[:, 0], motions.deltas[:, 1]), np.abs(motions.deltas[:, 2])
-    too_far = (metres > MAX_M_S * seconds) & (metres > LEAST_JUMP_M)
-    guessed = too_far | ((radians > MAX_RAD_S * seconds) & (radians > LEAST_JUMP_RAD))
-    if not guessed.any():
-        return motions
-    deltas, covariances = motions.deltas.copy(), motions.covariances.copy()
-    for k in np.flatnonzero(guessed).tolist():
-        deltas[k] = deltas[k - 1] / seconds[k - 1] * seconds[k] if k else 0.0
-        covariances[k] = np.diag(np.square(GUESSED))
-    return Motions(deltas, covariances, guessed)
 
 
 def dead_reckon(motions: Motions, start: Array | None = None) -> Array:

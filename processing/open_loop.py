@@ -21,10 +21,11 @@ from hw_profiles.profile import OdometryNoise
 from processing.chain import Chain, Contradiction
 from processing.chain_step import add_up
 from processing.geometry import accumulate, compose, interpolate_poses, relative
-from processing.odometry import Motions, odom_motions, wheel_motions, without_impossible
+from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
 from processing.scan_matching import Matcher
+from processing.skids import without_skids
 from processing.sweeps import StoredScans, Sweeps, velocities_of
 
 Array = NDArray[np.float64]
@@ -90,10 +91,10 @@ def odometry_at_scans(run: Run) -> Motions:
         first, second = (np.interp(every, run.motion_times, run.wheels[:, k]) for k in (0, 1))
         steps = wheel_motions(run.profile, first, second)
         motions = Motions(*add_up(steps.deltas, steps.covariances, np.searchsorted(every, times)))
-        return without_impossible(motions, np.diff(times))
+        return without_skids(motions, np.diff(times))
     assert run.odometry is not None
     motions = odom_motions(interpolate_poses(run.motion_times, run.odometry, times), FOREIGN_NOISE)
-    return without_impossible(motions, np.diff(times))
+    return without_skids(motions, np.diff(times))
 
 
 @dataclass(frozen=True, slots=True)

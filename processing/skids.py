@@ -1,0 +1,95 @@
+"""Skids: stretches in which the wheels did what no vehicle does, and then went on as before.
+
+In: the motions of an odometry, and how long each took. Out: the same, with the motions of a skid replaced by those of a
+vehicle that keeps rolling, in ample doubt. Wheels that lock, spin or jump change their motion at once; a vehicle needs
+a second for it. What does not come back within seconds was no skid: then the motion before may have been wrong.
+
+    speed  ────────┐        ┌────────       two changes that no vehicle makes, and the same speed before and after:
+                   └────────┘               between smooth walls nothing else would tell
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from processing.odometry import Motions
+
+Array = NDArray[np.float64]
+
+LONGEST_S = 3.0
+MAX_PACE_S, UNEVEN = 0.3, 1.5  # samples further apart, or at no pace, do not show which change is sudden
+SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
+OFF_M_S, OFF_RAD_S, SHARE = 0.5, 0.3, 0.15  # what stamps that are off by milliseconds make of a speed, besides
+STEADY_M_S2, STEADY_RAD_S2 = 0.3, 0.3  # how much it may have changed meanwhile
+MAX_M_S, MAX_RAD_S = 20.0, 5.0  # no vehicle drives or turns faster
+LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 1.0
+ROLLS = (0.05, 0.02, 0.02)  # m, m, rad: doubt of a step that was filled in
+
+
+def without_skids(motions: Motions, seconds: Array) -> Motions:
+    """The motions over so many `seconds` (n,), rolling on through every skid; `guessed` where they do."""
+    pace_s = float(np.median(seconds)) if len(seconds) else 0.0
+    seconds = np.maximum(seconds, pace_s / 2)  # times squeezed by a clock set back are no speed
+    velocities = motions.deltas / seconds[:, None]
+    guessed = _impossible(motions.deltas, velocities)
+    if pace_s <= MAX_PACE_S and np.quantile(seconds, 0.9) < UNEVEN * pace_s:
+        _find_skids(velocities, seconds, guessed)
+    if not guessed.any():
+        return motions
+    kept, number = np.flatnonzero(~guessed), np.arange(len(seconds))
+    rolling = np.column_stack([np.interp(number, kept, velocities[kept, of]) for of in range(3)])
+    deltas = np.where(guessed[:, None], rolling * seconds[:, None], motions.deltas)
+    ample = motions.covariances + np.diag(np.square(ROLLS))
+    impossible = guessed & _impossible(motions.deltas, velocities)
+    ample[impossible] = np.diag(np.square(ROLLS))  # their own doubt grew with a way that nobody drove
+    return Motions(deltas, np.where(guessed[:, None, None], ample, motions.covariances), guessed)
+
+
+def _impossible(deltas: Array, velocities: Array) -> NDArray[np.bool_]:
+    """Steps (n, 3) that are too far for any vehicle: a count or a pose that starts anew."""
+    metres, radians = np.hypot(deltas[:, 0], deltas[:, 1]), np.abs(deltas[:, 2])
+    too_far = (np.hypot(velocities[:, 0], velocities[:, 1]) > MAX_M_S) & (metres > LEAST_JUMP_M)
+    return np.asarray(too_far | ((np.abs(velocities[:, 2]) > MAX_RAD_S) & (radians > LEAST_JUMP_RAD)))
+
+
+@njit(cache=True)
+def _find_skids(velocities: Array, seconds: Array, guessed: NDArray[np.bool_]) -> None:
+    """Mark the skids among velocities (n, 3)."""
+    count = len(velocities)
+    before = -1  # the last motion that is believed
+    k = 0
+    while k < count:
+        if guessed[k]:
+            k += 1
+            continue
+        if before < 0 or not _is_sudden(velocities[before], velocities[k], seconds[k]):
+            before = k
+            k += 1
+            continue
+        elapsed, end = seconds[k], k + 1
+        while end < count and elapsed <= LONGEST_S:
+            sudden = _is_sudden(velocities[end - 1], velocities[end], seconds[end])
+            if sudden and not guessed[end] and _comes_back(velocities[before], velocities[end], elapsed):
+                break
+            elapsed += seconds[end]
+            end += 1
+        if end < count and elapsed <= LONGEST_S:
+            guessed[k:end] = True
+        else:
+            end = k + 1
+        before = end - 1 if end == k + 1 and not guessed[k] else before
+        k = end
+
+
+@njit(cache=True)
+def _is_sudden(before: Array, now: Array, elapsed_s: float) -> bool:
+    speed = abs(before[0])
+    changes = abs(now[0] - before[0]) > SPEED_UP_M_S2 * elapsed_s + OFF_M_S + SHARE * speed
+    return changes or abs(now[2] - before[2]) > TURN_UP_RAD_S2 * elapsed_s + OFF_RAD_S
+
+
+@njit(cache=True)
+def _comes_back(before: Array, now: Array, elapsed_s: float) -> bool:
+    speed = abs(before[0])
+    same = abs(now[0] - before[0]) < STEADY_M_S2 * elapsed_s + OFF_M_S / 2 + SHARE * speed
+    return same and abs(now[2] - before[2]) < STEADY_RAD_S2 * elapsed_s + OFF_RAD_S
