@@ -43,6 +43,8 @@ ASKEW_RAD = 0.05  # what moves along with the vehicle does not turn a match; one
 HALF_TRACK_M = 0.8  # of a vehicle of this kind
 SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
 PAUSE_S = 1.0  # a single match after a longer one convicts nobody: where the vehicle went meanwhile, wheels know best
+SUSPECT_S = 3.0
+STUCK_M, STUCK_RAD = 1e-3, 1e-4
 LONG_S = 0.3  # of a pause so long the motion before says as much as it ever will
 STEP_M, STEP_RAD = 0.05, 0.03  # what a match and a stamp may be off, besides
 AWRY = (0.3, 0.3, 0.2)  # m, m, rad: what convicted wheels may be off in one step, where the walls show nothing
@@ -72,8 +74,9 @@ class Chain:
 
     scan: Scan  # of the last key frame
 
-    def __init__(self, count: int, mount: Array, match: Matcher) -> None:
-        self.mount, self.match = mount, match
+    def __init__(self, count: int, mount: Array, match: Matcher, is_even: bool = True) -> None:
+        """`is_even`: scans and odometry keep an even pace, so that a sudden change of motion means something."""
+        self.mount, self.match, self.is_even = mount, match, is_even
         self.keyframes: list[int] = []
         self.motions: list[Array] = []
         self.covariances: list[Array] = []
@@ -84,6 +87,7 @@ class Chain:
         self.matched = np.zeros(count, bool)
         self.offset, self.covariance = np.zeros(3), np.zeros((3, 3))  # fused, since the key frame
         self.driven, self.driven_covariance = np.zeros(3), np.zeros((3, 3))  # by odometry alone, since the key frame
+        self.suspect_s = 0.0  # for how long the wheels have been suspect
         self.velocity: Array | None = None  # (3,) of the last step, m/s and rad/s
         self.wants_keyframe = False
 
@@ -114,9 +118,18 @@ class Chain:
         good = [of for of in tried if _is_good(of)]
         if not good:
             return False
-        possible = [of for of in good if self._is_possible(of, onward, seconds)]
+        possible = [of for of in good if self._is_possible(self._motion_of(of), onward, seconds)]
         best = max(possible or good, key=agreement)
         return self._judge(k, scan, best, bool(possible), wheels, step, onward, seconds)
+
+    def _are_suspect(self, step: Array, onward: Array, seconds: float) -> bool:
+        """Do the wheels say what the vehicle can hardly have done? Not for long: it may be the motion so far that is
+        wrong; but wheels that do not turn at all may be stuck.
+        """
+        still = Motion(join(self.offset, step), np.zeros((3, 3)))
+        self.suspect_s = 0.0 if self._is_possible(still, onward, seconds) else self.suspect_s + seconds
+        stuck = math.hypot(step[0], step[1]) < STUCK_M and abs(step[2]) < STUCK_RAD
+        return self.is_even and (0 < self.suspect_s < SUSPECT_S or (self.suspect_s > 0 and stuck))
 
     def find(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float) -> bool:
         """The same by a search around where the wheels say; what had to be searched for convicts nobody."""
@@ -152,6 +165,8 @@ class Chain:
         honest = _honest_share(missed, wheels.covariance)
         poses = (to_laser(self.mount, self.mount, pose) for pose in (demanded, wheels.pose + honest))
         against = objection(self.scan, scan, *poses) if possible else -1.0
+        if possible and against >= -OBJECTS and self._are_suspect(step, onward, seconds):
+            against = max(against, OBJECTS)  # what only a part of the view says is enough then
         within, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
         if np.allclose(honest, missed) or (within and NEUTRAL <= against < OBJECTS):
             self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
@@ -192,16 +207,15 @@ class Chain:
         """The next step of a vehicle that keeps its motion."""
         return step if self.velocity is None else self.velocity * seconds
 
-    def _is_possible(self, result: ScanMatch, onward: Array, seconds: float) -> bool:
-        """Could the vehicle have got there from its motion so far, as far as the walls see?"""
+    def _is_possible(self, motion: Motion, onward: Array, seconds: float) -> bool:
+        """Could the vehicle have got there from its motion so far, as far as that is known?"""
         if self.velocity is None:
             return True
         far, turned = (
             np.array([SPEED_UP_M_S2, TURN_UP_RAD_S2]) * min(seconds, LONG_S) ** 2 + (STEP_M, STEP_RAD)
         ).tolist()
         reach = self.covariance + np.diag([far**2, far**2, turned**2]) / CHI_SQUARED_3_999
-        walls = self._motion_of(result)
-        return fuse(join(self.offset, onward), reach, 1.0, walls.pose, walls.covariance)[0]
+        return fuse(join(self.offset, onward), reach, 1.0, motion.pose, motion.covariance)[0]
 
     def _without_wheels(self, step: Array, onward: Array, seconds: float) -> Motion:
         """Where convicted wheels and the motion so far put the vehicle together, and with what doubt."""

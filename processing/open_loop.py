@@ -25,7 +25,7 @@ from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
 from processing.scan_matching import Matcher
-from processing.skids import without_skids
+from processing.skids import has_pace, without_skids
 from processing.sweeps import StoredScans, Sweeps, velocities_of
 
 Array = NDArray[np.float64]
@@ -153,8 +153,8 @@ def straighten_by(sweeps: Sweeps, poses: Array) -> Sweeps:
 
 def _drive(segment: Segment, match: Matcher) -> DrivenSegment:
     sweeps, odometry = segment.sweeps, segment.odometry
-    chain = Chain(len(sweeps), sweeps.mount, match)
     seconds = np.diff(sweeps.times)
+    chain = Chain(len(sweeps), sweeps.mount, match, has_pace(seconds))
     scans = sweeps.scans(np.arange(len(sweeps)))
     before = next(scans)
     chain.add_keyframe(0, before)

@@ -19,8 +19,11 @@ Array = NDArray[np.float64]
 LONGEST_S = 3.0
 MAX_PACE_S, UNEVEN = 0.3, 1.5  # samples further apart, or at no pace, do not show which change is sudden
 SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
-OFF_M_S, OFF_RAD_S, SHARE = 0.5, 0.3, 0.15  # what stamps that are off by milliseconds make of a speed, besides
+OFF_M_S, OFF_RAD_S = 0.15, 0.1  # what an uneven floor makes of a speed, besides; and so many times
+NOISE = 6.0  # what stamps that are off and coarse counts make of it everywhere
+SHARE = 0.15
 STEADY_M_S2, STEADY_RAD_S2 = 0.3, 0.3  # how much it may have changed meanwhile
+MOVES_M_S = 0.1
 MAX_M_S, MAX_RAD_S = 20.0, 5.0  # no vehicle drives or turns faster
 LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 1.0
 ROLLS = (0.05, 0.02, 0.02)  # m, m, rad: doubt of a step that was filled in
@@ -32,8 +35,11 @@ def without_skids(motions: Motions, seconds: Array) -> Motions:
     seconds = np.maximum(seconds, pace_s / 2)  # times squeezed by a clock set back are no speed
     velocities = motions.deltas / seconds[:, None]
     guessed = _impossible(motions.deltas, velocities)
-    if pace_s <= MAX_PACE_S and np.quantile(seconds, 0.9) < UNEVEN * pace_s:
-        _find_skids(velocities, seconds, guessed)
+    if has_pace(seconds):
+        changes = np.abs(np.diff(velocities[:, [0, 2]], axis=0))
+        usual = np.median(changes[np.abs(velocities[1:, 0]) > MOVES_M_S], axis=0) if len(changes) else np.zeros(2)
+        off = np.array([OFF_M_S, OFF_RAD_S]) + NOISE * np.nan_to_num(usual, nan=0.0)
+        _find_skids(velocities, seconds, off, guessed)
     if not guessed.any():
         return motions
     kept, number = np.flatnonzero(~guessed), np.arange(len(seconds))
@@ -45,6 +51,12 @@ def without_skids(motions: Motions, seconds: Array) -> Motions:
     return Motions(deltas, np.where(guessed[:, None, None], ample, motions.covariances), guessed)
 
 
+def has_pace(seconds: Array) -> bool:
+    """Do samples so many `seconds` (n,) apart come quickly and evenly enough to show sudden changes?"""
+    pace_s = float(np.median(seconds)) if len(seconds) else np.inf
+    return bool(pace_s <= MAX_PACE_S and np.quantile(seconds, 0.9) < UNEVEN * pace_s)
+
+
 def _impossible(deltas: Array, velocities: Array) -> NDArray[np.bool_]:
     """Steps (n, 3) that are too far for any vehicle: a count or a pose that starts anew."""
     metres, radians = np.hypot(deltas[:, 0], deltas[:, 1]), np.abs(deltas[:, 2])
@@ -53,8 +65,8 @@ def _impossible(deltas: Array, velocities: Array) -> NDArray[np.bool_]:
 
 
 @njit(cache=True)
-def _find_skids(velocities: Array, seconds: Array, guessed: NDArray[np.bool_]) -> None:
-    """Mark the skids among velocities (n, 3)."""
+def _find_skids(velocities: Array, seconds: Array, off: Array, guessed: NDArray[np.bool_]) -> None:
+    """Mark the skids among velocities (n, 3), which may be `off` (2,) by so many m/s and rad/s."""
     count = len(velocities)
     before = -1  # the last motion that is believed
     k = 0
@@ -62,14 +74,14 @@ def _find_skids(velocities: Array, seconds: Array, guessed: NDArray[np.bool_]) -
         if guessed[k]:
             k += 1
             continue
-        if before < 0 or not _is_sudden(velocities[before], velocities[k], seconds[k]):
+        if before < 0 or not _is_sudden(velocities[before], velocities[k], seconds[k], off):
             before = k
             k += 1
             continue
         elapsed, end = seconds[k], k + 1
         while end < count and elapsed <= LONGEST_S:
-            sudden = _is_sudden(velocities[end - 1], velocities[end], seconds[end])
-            if sudden and not guessed[end] and _comes_back(velocities[before], velocities[end], elapsed):
+            sudden = _is_sudden(velocities[end - 1], velocities[end], seconds[end], off)
+            if sudden and not guessed[end] and _comes_back(velocities[before], velocities[end], elapsed, off):
                 break
             elapsed += seconds[end]
             end += 1
@@ -82,14 +94,13 @@ def _find_skids(velocities: Array, seconds: Array, guessed: NDArray[np.bool_]) -
 
 
 @njit(cache=True)
-def _is_sudden(before: Array, now: Array, elapsed_s: float) -> bool:
-    speed = abs(before[0])
-    changes = abs(now[0] - before[0]) > SPEED_UP_M_S2 * elapsed_s + OFF_M_S + SHARE * speed
-    return changes or abs(now[2] - before[2]) > TURN_UP_RAD_S2 * elapsed_s + OFF_RAD_S
+def _is_sudden(before: Array, now: Array, elapsed_s: float, off: Array) -> bool:
+    changes = abs(now[0] - before[0]) > SPEED_UP_M_S2 * elapsed_s + off[0]
+    return changes or abs(now[2] - before[2]) > TURN_UP_RAD_S2 * elapsed_s + off[1]
 
 
 @njit(cache=True)
-def _comes_back(before: Array, now: Array, elapsed_s: float) -> bool:
+def _comes_back(before: Array, now: Array, elapsed_s: float, off: Array) -> bool:
     speed = abs(before[0])
-    same = abs(now[0] - before[0]) < STEADY_M_S2 * elapsed_s + OFF_M_S / 2 + SHARE * speed
-    return same and abs(now[2] - before[2]) < STEADY_RAD_S2 * elapsed_s + OFF_RAD_S
+    same = abs(now[0] - before[0]) < STEADY_M_S2 * elapsed_s + off[0] + SHARE * speed
+    return same and abs(now[2] - before[2]) < STEADY_RAD_S2 * elapsed_s + off[1]
