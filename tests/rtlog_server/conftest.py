@@ -231,6 +231,12 @@ class EncoderHost:
         ticks = (self.readings[-1].complete_ns - self.grid.start_ns) // self.grid.period_ns + 2
         assert len(self.readings) <= ticks
 
+    def wait_for_all(self) -> EncoderReading:
+        """The next reading that no encoder is missing in; on a busy machine an answer may come too late for one."""
+        first = len(self.readings)
+        self.wait_for(lambda: any(len(reading.names) == 2 for reading in self.readings[first:]))
+        return next(reading for reading in self.readings[first:] if len(reading.names) == 2)
+
     def wait_for_message(self, part: str) -> None:
         """It may be over by then."""
         self.wait_for(lambda: self.told(part))
