@@ -78,6 +78,7 @@ class Server:
     """A server process and a zenoh client of it."""
 
     process: subprocess.Popen[bytes]
+    started_ns: int  # UTC
     stderr: Path
     name: str
     session: zenoh.Session
@@ -131,13 +132,14 @@ def run_server(folder: Path, toml: str, name: str, zenoh_port: int) -> Generator
     profile, stderr = folder / "profile.toml", folder / "stderr.txt"
     profile.write_text(toml, encoding="utf-8")
     command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
+    started_ns = time.time_ns()
     with stderr.open("wb") as sink:
         # a session of its own, as under systemd: the signals of this test process's terminal do not reach it
         process = subprocess.Popen(command, stderr=sink, start_new_session=True)
     session = None
     try:
         session = connect_client(zenoh_port)
-        server = Server(process, stderr, name, session)
+        server = Server(process, started_ns, stderr, name, session)
         for key in (f"rtlog/{name}/**", f"rtlog/{name}/@heartbeat"):
             session.declare_subscriber(key, lambda sample: server.received.append(_received(sample)))
         yield server
@@ -189,6 +191,12 @@ class Drive:
             due_ns += int(self.scan_s * 1e9)
             start_rad, remission = math.radians(-135), np.full(self.RAYS, 100.0)
             self.laser.send_scan(ranges_m, self.first_rays_ns[-1], start_rad, self.STEP_RAD, remission)
+
+    def late_ns(self, positions_rad: np.ndarray, stamp_ns: int) -> np.ndarray:
+        """(W,) after the stamp, each wheel was at its position; in less than half a turn's time."""
+        turns_per_ns = np.array(list(self.TURNS_PER_S.values())) * 1e-9
+        turns = positions_rad / (2 * math.pi) - turns_per_ns * stamp_ns
+        return (turns - np.round(turns)) / turns_per_ns
 
     def read_tag(self, epc: str) -> None:
         self.rfid.read_tag(epc)

@@ -1,9 +1,11 @@
 """Counting on over many turns, and the angles that JointState tells."""
 
 import math
+import sys
 import threading
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -21,6 +23,9 @@ from rtlog_server.devices.encoders import (
     position_rad,
 )
 from rtlog_server.messages import OK, STALE
+
+sys.path.insert(0, str(Path(__file__).parent))
+from patience import PATIENCE_S
 
 COUNTS = 4096
 RADIUS_M = 0.35
@@ -173,7 +178,7 @@ def test_encoders_are_stale_after_three_ticks_but_not_too_soon(period_ms: int, p
     device = Wordless()
     before_ns = time.monotonic_ns()
     device.start(TickGrid(before_ns, period_ms * 1_000_000))
-    assert device.serving.wait(10.0)
+    assert device.serving.wait(PATIENCE_S)
     after_ns = time.monotonic_ns()
     assert device.collect(before_ns + (patience_ms - 1) * 1_000_000).state == OK
     assert device.collect(after_ns + (patience_ms + 1) * 1_000_000).state == STALE

@@ -1,8 +1,10 @@
 """At a tick: devices whose threads run, samples handed over by hand, the messages as bytes of the contract."""
 
 import math
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ from rtlog_server.messages import MISSING, OK, STALE, decode, to_ns
 from rtlog_server.sampler import Sampler
 from rtlog_server.ticker import TickTime
 from rtlog_server.topics import BY_NAME
+
+sys.path.insert(0, str(Path(__file__).parent))
+from patience import wait_until
 
 MS = 1_000_000
 PERIOD_NS = 100 * MS
@@ -47,10 +52,7 @@ class HandFed(Device[Any]):
     def go(self, there: bool) -> None:
         """Come or go away, and wait until the frame has noticed."""
         self.there = there
-        deadline = time.monotonic() + 5.0
-        while self.connected != there:
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+        wait_until(lambda: self.connected == there)
 
 
 class Bench:
@@ -63,6 +65,8 @@ class Bench:
         for device in self.devices:
             device.start(grid)
             device.go(there=True)
+        for device in self.devices:
+            device.heard()
         self.start_ns = time.monotonic_ns()
         self.sampler = Sampler(self.devices, UTC_OFFSET_NS)
 
