@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -35,8 +36,7 @@ config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", sys.argv[1])
 config.insert_json5("transport/shared_memory/enabled", "false")
 session = zenoh.open(config)
-subscriber = session.declare_subscriber("rtlog/**", lambda sample: None)
-print("ready", flush=True)
+subscriber = session.declare_subscriber("rtlog/**", lambda sample: print("heard", flush=True))
 time.sleep(300)
 """
 
@@ -117,7 +117,8 @@ def test_a_subscriber_that_stands_still_holds_nothing_up(info: ServerInfo) -> No
         command = [sys.executable, "-c", STALLED_SUBSCRIBER, endpoints]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as subscriber:
             assert subscriber.stdout is not None
-            assert subscriber.stdout.readline() == b"ready\n"
+            while not select.select([subscriber.stdout], [], [], 0.01)[0]:
+                publisher.publish(Bundle(0, [Sample(SCAN, 0, b"")], None))  # until the subscription has arrived
             os.kill(subscriber.pid, signal.SIGSTOP)
             longest_s = 0.0
             for k in range(200):
