@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import zenoh
+from patience import PATIENCE_S, Told, wait_until
 
 from rtlog_server.attachment import Attachment, unpack_attachment
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
@@ -25,8 +26,7 @@ from rtlog_server.devices.encoders import EncoderReading
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S, Told, wait_until
+sys.path.insert(0, str(Path(__file__).parent))  # wheels.py
 
 PROFILE = """\
 schema = 1

@@ -3,12 +3,12 @@
 import json
 import re
 import socket
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE_S, wait_until
 
 from hw_profiles.profile import CanBus, Profile, load_profile, parse_profile
 from rtlog_server.check import check_devices
@@ -16,9 +16,6 @@ from rtlog_server.cli import main
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.finding import Finding
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S, wait_until
 
 SILENT_WHEEL = [("encoders", "identity of right_wheel"), ("encoders", "driver")]
 Found = dict[tuple[str, str], Finding]

@@ -7,11 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.cli import main
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S
 
 COMMAND = [sys.executable, "-m", "rtlog_server.cli"]
 

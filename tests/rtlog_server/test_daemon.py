@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 import time
 import tomllib
 from collections.abc import Callable
@@ -12,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.messages import MISSING, decode, to_ns
 from rtlog_server.topics import BY_NAME
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S
 
 PERIOD_NS = 100_000_000
 CLOCKS_NS = 1_000_000  # by which wall clock and monotonic clock may part while a server runs

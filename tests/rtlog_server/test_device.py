@@ -1,18 +1,14 @@
 """The frame of every driver: a fault in a driver costs a reconnect, not the sensor."""
 
 import logging
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S, wait_until
 
 from rtlog_server.devices.device import Device, TickGrid
 from rtlog_server.messages import MISSING, OK
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S, wait_until
 
 
 class FaultyOnce(Device):  # type: ignore[type-arg]

@@ -1,15 +1,14 @@
 """Counting on over many turns, and the angles that JointState tells."""
 
 import math
-import sys
 import threading
 import time
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from patience import PATIENCE_S
 
 from hw_profiles.profile import Encoder
 from rtlog_server.devices.device import TickGrid
@@ -23,9 +22,6 @@ from rtlog_server.devices.encoders import (
     position_rad,
 )
 from rtlog_server.messages import OK, STALE
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S
 
 COUNTS = 4096
 RADIUS_M = 0.35

@@ -4,21 +4,18 @@ import json
 import logging
 import math
 import socket
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.bundle import DeviceReport, LatenessSummary, Report, ServerInfo
 from rtlog_server.health import ReportTimer, diagnostics, notify, status, status_line
 from rtlog_server.messages import MISSING, OK, STALE, decode, encode, to_ns
 from rtlog_server.ticker import TickTime
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S
 
 LATENESS = LatenessSummary(600, 2, 1e-4, 5e-4, 0.25, [(1e-4, 500), (0.25, 100)])
 DEVICES = [

@@ -1,13 +1,10 @@
 """The outbox on a real pipe: bounded, never waiting, in order, counted."""
 
 import multiprocessing
-import sys
-from pathlib import Path
+
+from patience import PATIENCE_S
 
 from rtlog_server.outbox import Outbox
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S
 
 
 def test_put_never_waits_and_counts_what_finds_it_full() -> None:

@@ -10,18 +10,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from uuid import UUID
 
 import pytest
 import zenoh
+from patience import PATIENCE_S, wait_until
 
 from rtlog_server.attachment import Attachment, unpack_attachment
 from rtlog_server.bundle import Bundle, LatenessSummary, Report, Sample, ServerInfo
 from rtlog_server.publish import Publisher, publish_bundles
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S, wait_until
 
 BOOT = UUID("00112233-4455-6677-8899-aabbccddeeff")
 REPORT = Report(1_700_000_000_000_000_000, [], LatenessSummary(1, 0, 0.0, 0.0, 0.0, []), 0, {})

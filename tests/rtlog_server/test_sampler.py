@@ -1,14 +1,13 @@
 """At a tick: devices whose threads run, samples handed over by hand, the messages as bytes of the contract."""
 
 import math
-import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import wait_until
 
 from rtlog_server.bundle import Sample
 from rtlog_server.devices.device import Device, DeviceError, TickGrid
@@ -19,9 +18,6 @@ from rtlog_server.messages import MISSING, OK, STALE, decode, to_ns
 from rtlog_server.sampler import Sampler
 from rtlog_server.ticker import TickTime
 from rtlog_server.topics import BY_NAME
-
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import wait_until
 
 MS = 1_000_000
 PERIOD_NS = 100 * MS

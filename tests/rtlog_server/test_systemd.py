@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 from patience import PATIENCE_S
 
 UNIT = Path(__file__).parents[2] / "systemd/rtlog-server.service"

@@ -1,21 +1,18 @@
 """Emulated encoders on a CAN bus, and their driver, collected at each tick."""
 
 import socket
-import sys
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+from wheels import Wheels
 
 from hw_profiles.profile import CanBus, Encoder
 from rtlog_server.devices.cia406 import nodes
 from rtlog_server.devices.cia406.driver import Cia406Encoders
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from wheels import Wheels
 
 COUNTS = 4096
 PERIOD_NS = 40_000_000

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 import zenoh
+from patience import PATIENCE_S, wait_until
+from wheels import Wheels
 
 from hw_profiles.profile import CanBus, shipped_profiles
 from rtlog_server.attachment import unpack_attachment
@@ -17,10 +19,6 @@ from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.messages import decode, to_ns
 from rtlog_server.ticker import utc_offset_ns
 from rtlog_server.topics import JOINT_STATES, TICK
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, wait_until
-from wheels import Wheels
 
 COUNTS = 4096
 TURNS_PER_S = {0x10: 1.1, 0x11: -0.7}

@@ -1,22 +1,18 @@
 """The CAN encoders' driver against emulated encoders, over python-can's buses and an slcan adapter on a terminal."""
 
 import math
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
+from wheels import Wheels
 
 from hw_profiles.profile import CanBus, Encoder
 from rtlog_server.devices.cia406 import protocol
 from rtlog_server.devices.cia406.emulated_encoder import Entry
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.messages import OK
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from wheels import Wheels
 
 COUNTS = 4096
 ADDRESSES = {"left_wheel": 5, "right_wheel": 9}

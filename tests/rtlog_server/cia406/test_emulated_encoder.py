@@ -1,21 +1,17 @@
 """The emulated encoder judged by canopen's master, which is nobody's here: objects, PDOs, network management."""
 
-import sys
 import time
 import uuid
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
 import can
 import canopen
 import pytest
+from patience import PATIENCE_S, wait_until
 
 from hw_profiles.profile import CanBus
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, wait_until
 
 COUNTS = 4096
 POSITION = 123_456

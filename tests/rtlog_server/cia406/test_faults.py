@@ -3,15 +3,14 @@
 import itertools
 import os
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import can
 import pytest
+from patience import PATIENCE_S, in_use, left_behind, wait_until
 
 from hw_profiles.profile import CanBus, Encoder
 from rtlog_server.devices.cia406 import protocol
@@ -20,9 +19,6 @@ from rtlog_server.devices.cia406.emulator import CanBusEmulator
 from rtlog_server.devices.cia406.protocol import Frame
 from rtlog_server.devices.device import TickGrid
 from rtlog_server.messages import MISSING
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, in_use, left_behind, wait_until
 
 COUNTS = 4096
 PERIOD_NS = 40_000_000

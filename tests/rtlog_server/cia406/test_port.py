@@ -1,6 +1,5 @@
 """The CAN interface: which frames come through, and what the controller's own reports become."""
 
-import sys
 import time
 import uuid
 from collections.abc import Iterator
@@ -8,15 +7,13 @@ from pathlib import Path
 
 import can
 import pytest
+from patience import PATIENCE_S
 
 from hw_profiles.profile import CanBus
 from rtlog_server.devices.cia406.port import CanPort
 from rtlog_server.devices.cia406.protocol import Frame
 from rtlog_server.devices.cia406.slcan_adapter import SlcanAdapter
 from rtlog_server.devices.device import DeviceError
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S
 
 BUS = CanBus(interface="virtual", channel=uuid.uuid4().hex)
 
