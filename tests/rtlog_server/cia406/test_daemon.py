@@ -135,7 +135,7 @@ from rtlog_server.devices import open_devices
 open_devices(load_profile("simulated"))
 sys.exit(any(name in sys.modules for name in ("can", "canopen")))
 """
-    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_both_vehicles_are_shipped_with_their_encoders_on_can() -> None:
