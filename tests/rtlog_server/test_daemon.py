@@ -169,8 +169,12 @@ def test_a_signal_ends_it_with_everything_published(start_server: StartServer, n
     server.wait_until(lambda: len(server.on("rtlog/tick")) >= 5)
     os.killpg(server.process.pid, number)  # as a terminal or systemd does: to both processes
     assert server.process.wait(timeout=PATIENCE_S) == 0
-    beat = json.loads(server.on("@heartbeat")[-1].payload)
-    assert beat["last_sequence"]["/rtlog/tick"] == beat["last_tick"] == ticks_of(server)[-1].index
+
+    def all_is_here() -> bool:
+        beat = json.loads(server.on("@heartbeat")[-1].payload)
+        return beat["last_sequence"]["/rtlog/tick"] == beat["last_tick"] == ticks_of(server)[-1].index
+
+    server.wait_until(all_is_here)
     assert "Traceback" not in server.stderr.read_text()
 
 
