@@ -154,4 +154,5 @@ def feed() -> Iterator[Callable[..., Feeder]]:
     yield feed
     for feeder in feeders:
         feeder.stop()
+    for feeder in feeders:  # several may have fed one
         feeder.emulator.close()
