@@ -72,7 +72,7 @@ class Process:
         with self._news:
             self._news.notify_all()
 
-    def wait_for(self, word: str, timeout_s: float = 30.0) -> None:
+    def wait_for(self, word: str, timeout_s: float = 60.0) -> None:
         with self._news:
             if not self._news.wait_for(lambda: any(word in line for line in self.lines), timeout_s):
                 pytest.fail(f"no {word!r} in {''.join(self.lines)}")
@@ -175,9 +175,9 @@ class Rig:
             replay = stack.enter_context(self.replay(recording, faults, *options))
             report = replay.finish(timeout_s=60)
             recorder.popen.send_signal(signal.SIGINT)
-            summary = recorder.finish(timeout_s=30)
+            summary = recorder.finish(timeout_s=60)
             server.popen.terminate()
-            server.finish(timeout_s=30)
+            server.finish(timeout_s=60)
         return self.compare(recording, report, summary, "".join(server.lines))
 
     def replay(self, recording: Path, faults: str, *options: object) -> Any:

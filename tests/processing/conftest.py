@@ -88,7 +88,7 @@ def small_atlas(small_world: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     atlas = tmp_path_factory.mktemp("small_atlas") / "small.atlas"
     recordings = [small_world / "small-around.mcap", small_world / "small-back.mcap"]
     command = [sys.executable, "-m", "processing.cli", "build", *recordings, "-o", atlas, "--jobs", "2"]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    subprocess.run(command, check=True, capture_output=True)
     return atlas
 
 

@@ -8,13 +8,13 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE_S, wait_until
 
 COMMAND = [sys.executable, "-m", "processing.cli"]
 VERBS = ["build", "info", "report", "compare", "simulate", "import"]
@@ -22,7 +22,7 @@ HEAVY = ("numba", "numpy", "PIL", "scipy", "shapely", "zenoh", "tqdm", "mcap")
 
 
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, *arguments], cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run([*COMMAND, *arguments], cwd=cwd, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -32,7 +32,7 @@ def test_help_has_an_example_and_does_not_wait_for_compilers_and_solvers(verb: s
         f"atexit.register(lambda: print('loaded:', *[name for name in {HEAVY} if name in sys.modules]))\n"
         f"processing.cli.main([{verb!r}, '--help'])\n"
     )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")
     assert f"example:\n  rtlog-atlas {verb} " in result.stdout
     assert result.stdout.splitlines()[-1].strip() == "loaded:"
@@ -46,7 +46,7 @@ def test_help_lists_the_verbs() -> None:
 
 def test_the_command_is_installed() -> None:
     program = Path(sys.executable).with_name("rtlog-atlas")
-    result = subprocess.run([program, "info", "--help"], capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run([program, "info", "--help"], capture_output=True, text=True, check=False)
     assert result.returncode == 0
     assert "usage: rtlog-atlas info" in result.stdout
 
@@ -118,7 +118,7 @@ def finish(atlas: Path, document: dict[str, Any]) -> subprocess.CompletedProcess
     atlas.mkdir()
     (atlas / "atlas.json").write_text(json.dumps(document))
     command = [sys.executable, "-c", FINISHING, atlas]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return subprocess.run(command, capture_output=True, text=True, check=True)
 
 
 def test_a_build_of_which_there_is_nothing_to_know_says_no_more(small_atlas: Path, tmp_path: Path) -> None:
@@ -156,11 +156,9 @@ def building(recordings: Path, atlas: Path, jobs: int) -> Iterator[tuple[subproc
         try:
             said = b""
             while b"runs:" not in said:
-                assert select.select([terminal], [], [], 60)[0], said
+                assert select.select([terminal], [], [], PATIENCE_S)[0], said
                 said += os.read(terminal, 4096)
-            deadline = time.monotonic() + 20
-            while len(workers_of(process.pid)) < (jobs if jobs > 1 else 0):
-                assert time.monotonic() < deadline, "no workers"
+            wait_until(lambda: len(workers_of(process.pid)) >= (jobs if jobs > 1 else 0))
             yield process, terminal
         finally:
             for left in session_of(process.pid):
@@ -184,7 +182,7 @@ def last_words(terminal: int) -> list[str]:
     """The lines that remain on the terminal until the program closes it; the bars were wiped out."""
     said = b""
     try:
-        while select.select([terminal], [], [], 60)[0]:
+        while select.select([terminal], [], [], PATIENCE_S)[0]:
             said += os.read(terminal, 4096)
     except OSError:  # EIO: nobody has the other end open any more
         pass
@@ -206,10 +204,7 @@ def session_of(leader: int) -> list[int]:
 
 
 def assert_alone(leader: int) -> None:
-    deadline = time.monotonic() + 10
-    while left := session_of(leader):
-        assert time.monotonic() < deadline, left
-        time.sleep(0.02)
+    wait_until(lambda: not session_of(leader), lambda: session_of(leader))
 
 
 @pytest.mark.parametrize(
@@ -227,7 +222,7 @@ def test_an_interrupted_build_leaves_nothing_behind(
         (os.killpg if whole_group else os.kill)(process.pid, number)
         assert last_words(terminal) == ["rtlog-atlas: interrupted"]
         # 130, as a shell says it; CPython itself dies of SIGINT if that was handled within a string that it executed
-        assert process.wait(timeout=10) in (130, -signal.SIGINT)
+        assert process.wait(timeout=PATIENCE_S) in (130, -signal.SIGINT)
         assert_alone(process.pid)
     assert not list(tmp_path.iterdir())
 
@@ -238,7 +233,7 @@ def test_a_process_that_dies_is_one_line(small_world: Path, tmp_path: Path) -> N
         assert last_words(terminal) == [
             "rtlog-atlas: a process died, perhaps for want of memory; try fewer --jobs",
         ]
-        assert process.wait(timeout=10) == 1
+        assert process.wait(timeout=PATIENCE_S) == 1
         assert_alone(process.pid)
     assert not list(tmp_path.iterdir())
 
@@ -249,7 +244,7 @@ def test_a_program_that_is_killed_takes_its_processes_along(
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away what is in there
     with building(small_world, tmp_path / "a.atlas", jobs=2) as (process, _):
         os.kill(process.pid, signal.SIGKILL)
-        assert process.wait(timeout=10) == -signal.SIGKILL
+        assert process.wait(timeout=PATIENCE_S) == -signal.SIGKILL
         assert_alone(process.pid)
     assert not (tmp_path / "a.atlas").exists()
 
@@ -274,5 +269,5 @@ sys.exit(cli.main(["info", "any.atlas"]))
 
 def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
     command = [sys.executable, "-c", SWALLOWING]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (130, "rtlog-atlas: interrupted\n")

@@ -5,7 +5,6 @@ import json
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from uuid import UUID, uuid4
 import numpy as np
 import pytest
 import zenoh
+from patience import wait_until
 
 from rtlog_client.compare import Comparison, compare_recordings
 from rtlog_client.replay_report import ReplayReport
@@ -99,10 +99,7 @@ class BenchServer:
         self._tokens.append(self._session.liveliness().declare_token(f"rtlog/{vehicle}/@server/{self.boot_id}"))
 
     def wait_for_subscriber(self) -> None:
-        deadline = time.monotonic() + 10
-        while not all(p.matching_status.matching for p in [self._beat, *self._publishers.values()]):
-            assert time.monotonic() < deadline, "nobody subscribed"
-            time.sleep(0.01)
+        wait_until(lambda: all(p.matching_status.matching for p in [self._beat, *self._publishers.values()]))
 
     def tick(self, k: int, lose: Collection[str] = (), twice: bool = False) -> None:
         """Publish tick k; topics in `lose` use up their sequence number and are not sent."""

@@ -2,11 +2,12 @@
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from patience import wait_until
 
 from hw_profiles.errors import BadInputError, RTLogError
 from rtlog_client.fault_player import FaultPlayer
@@ -27,17 +28,10 @@ def play(lines: dict[str, Line], *faults: Fault) -> FaultPlayer:
     return FaultPlayer(FaultScript(fault=list(faults)), lines, time.monotonic_ns(), 0)
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_an_address_that_is_taken_during_a_restart_is_told(wire: TcpWire) -> None:
     with ExitStack() as stack:
         line = Line(wire, lambda: stack.enter_context(socket.create_server(wire.address)) and None)
-        player = play({"laser/primary": line}, Fault(device="laser/primary", kind="restart", at_s=0.0, for_s=0.1))
+        player = play({"laser/primary": line}, Fault(device="laser/primary", kind="restart", at_s=0.0, for_s=60.0))
         wait_until(lambda: wire.fault is not None)
         with pytest.raises(RTLogError, match=r"restart of laser/primary: .*in use"):
             player.close()

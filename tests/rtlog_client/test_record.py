@@ -5,7 +5,6 @@ import logging
 import os
 import shutil
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from patience import PATIENCE_S, wait_until
 from rosbags.highlevel import AnyReader
 
 from hw_profiles.errors import BadInputError, RTLogError
@@ -41,16 +41,17 @@ class Recording:
         self.progress = progress
 
     def wait(self, condition: Callable[[Progress], bool]) -> Progress:
-        deadline = time.monotonic() + 15
-        while self.progress is None or not condition(self.progress):
-            assert time.monotonic() < deadline, f"{self.progress}"
+        def is_so() -> bool:
             assert not self.future.done(), self.future.exception()
-            time.sleep(0.02)
+            return self.progress is not None and condition(self.progress)
+
+        wait_until(is_so, lambda: self.progress)
+        assert self.progress is not None
         return self.progress
 
     def stop(self) -> list[RunSummary]:
         self.stopping.set()
-        return self.future.result(10)
+        return self.future.result(PATIENCE_S)
 
 
 @pytest.fixture
@@ -230,7 +231,7 @@ def test_a_disk_that_fills_up_leaves_a_finished_file(
     with ballast.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, 2 * margin)
     with pytest.raises(RTLogError, match="the disk is full"):
-        recording.future.result(10)
+        recording.future.result(PATIENCE_S)
     ballast.unlink()
     assert read_info(tmp_path / "run.mcap").message_counts[TICK.name] == 20
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_client.cli import main
 from rtlog_client.log_file import read_info
@@ -45,7 +46,7 @@ def test_a_signal_leaves_a_finished_file(start_server: StartServer, tmp_path: Pa
     with record_command(server, tmp_path, "--json") as process:
         record_30_ticks(server, process)
         process.send_signal(number)
-        output, _ = process.communicate(timeout=10)
+        output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     [summary] = json.loads(output)
     assert summary["ticks"] == 30

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from patience import PATIENCE_S, wait_until
 
 from hw_profiles.profile import CanBus
 from rtlog_client.can_wire import CanWire
 from rtlog_client.faults import Fault
 from rtlog_client.serial_wire import SerialWire
 from rtlog_client.tcp_wire import TcpWire
+from rtlog_client.wire import Wire
 from rtlog_server.devices.cia406.port import CanPort
 from rtlog_server.devices.cia406.protocol import Frame
-
-PATIENCE_S = 10.0
 
 
 def fault(kind: str, **more: float | str) -> Fault:
@@ -34,6 +34,7 @@ class EchoDevice:
 
     def __init__(self, name: bytes = b"") -> None:
         self._name = name
+        self.sent = 0
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.address = self._listener.getsockname()
         threading.Thread(target=self._accept, daemon=True).start()
@@ -51,6 +52,7 @@ class EchoDevice:
             try:
                 while data := client.recv(65536):
                     client.sendall(self._name + data)
+                    self.sent += len(data)
             except OSError:
                 return
 
@@ -111,22 +113,31 @@ def test_an_end_that_hangs_up_is_heard_at_the_other(wire: TcpWire) -> None:
         assert receive(host, 100) == b"last words"  # and then the end
 
 
-def test_what_is_dropped_never_comes(wire: TcpWire) -> None:
+def settle(wire: Wire) -> None:
+    """Until what has come to the wire is dealt with: its thread does in turn what is there."""
+    for _ in range(2):
+        wire._call(lambda: None)
+
+
+def test_what_is_dropped_never_comes(device: EchoDevice, wire: TcpWire) -> None:
     with call(wire) as host:
         wire.begin(fault("drop"))
         host.sendall(b"lost")
+        wait_until(lambda: device.sent == 4)
+        settle(wire)
         assert not hears(host, 0.2)
         wire.end()
         host.sendall(b"heard")
         assert receive(host, 5) == b"heard"
 
 
-def test_what_is_delayed_comes_later_in_order(wire: TcpWire) -> None:
+def test_what_is_delayed_comes_later_in_order(device: EchoDevice, wire: TcpWire) -> None:
     with call(wire) as host:
         wire.begin(fault("delay", by_s=0.3))
         began = time.monotonic()
         host.sendall(b"late")
-        time.sleep(0.05)
+        wait_until(lambda: device.sent == 4)
+        settle(wire)
         wire.end()
         host.sendall(b"after")
         assert receive(host, 9) == b"lateafter"
@@ -280,6 +291,7 @@ def test_an_encoder_without_power_is_silent_behind_its_adapter(
     serial.begin(fault("restart"))
     os.write(port, b"x")
     assert not select.select([terminal], [], [], 0.2)[0]
+    settle(serial)
     serial.end()
     os.write(port, b"y")
     assert os.read(terminal, 8) == b"y"

@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import zenoh
+from patience import PATIENCE_S, Told, wait_until
 
 from rtlog_server.attachment import Attachment, unpack_attachment
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
@@ -25,8 +26,7 @@ from rtlog_server.devices.encoders import EncoderReading
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 
-sys.path.insert(0, str(Path(__file__).parent))
-from patience import PATIENCE_S, Told, wait_until
+sys.path.insert(0, str(Path(__file__).parent))  # wheels.py
 
 PROFILE = """\
 schema = 1
@@ -78,6 +78,7 @@ class Server:
     """A server process and a zenoh client of it."""
 
     process: subprocess.Popen[bytes]
+    started_ns: int  # UTC
     stderr: Path
     name: str
     session: zenoh.Session
@@ -131,13 +132,14 @@ def run_server(folder: Path, toml: str, name: str, zenoh_port: int) -> Generator
     profile, stderr = folder / "profile.toml", folder / "stderr.txt"
     profile.write_text(toml, encoding="utf-8")
     command = [sys.executable, "-m", "rtlog_server.cli", "run", "--profile", str(profile)]
+    started_ns = time.time_ns()
     with stderr.open("wb") as sink:
         # a session of its own, as under systemd: the signals of this test process's terminal do not reach it
         process = subprocess.Popen(command, stderr=sink, start_new_session=True)
     session = None
     try:
         session = connect_client(zenoh_port)
-        server = Server(process, stderr, name, session)
+        server = Server(process, started_ns, stderr, name, session)
         for key in (f"rtlog/{name}/**", f"rtlog/{name}/@heartbeat"):
             session.declare_subscriber(key, lambda sample: server.received.append(_received(sample)))
         yield server
@@ -190,6 +192,12 @@ class Drive:
             start_rad, remission = math.radians(-135), np.full(self.RAYS, 100.0)
             self.laser.send_scan(ranges_m, self.first_rays_ns[-1], start_rad, self.STEP_RAD, remission)
 
+    def late_ns(self, positions_rad: np.ndarray, stamp_ns: int) -> np.ndarray:
+        """(W,) after the stamp, each wheel was at its position; in less than half a turn's time."""
+        turns_per_ns = np.array(list(self.TURNS_PER_S.values())) * 1e-9
+        turns = positions_rad / (2 * math.pi) - turns_per_ns * stamp_ns
+        return (turns - np.round(turns)) / turns_per_ns
+
     def read_tag(self, epc: str) -> None:
         self.rfid.read_tag(epc)
         self.tag_reads += 1
@@ -230,6 +238,12 @@ class EncoderHost:
         """At most: a round that comes late delays none of the others, and none is asked twice for a tick."""
         ticks = (self.readings[-1].complete_ns - self.grid.start_ns) // self.grid.period_ns + 2
         assert len(self.readings) <= ticks
+
+    def wait_for_all(self) -> EncoderReading:
+        """The next reading that no encoder is missing in; on a busy machine an answer may come too late for one."""
+        first = len(self.readings)
+        self.wait_for(lambda: any(len(reading.names) == 2 for reading in self.readings[first:]))
+        return next(reading for reading in self.readings[first:] if len(reading.names) == 2)
 
     def wait_for_message(self, part: str) -> None:
         """It may be over by then."""

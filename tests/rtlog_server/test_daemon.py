@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.messages import MISSING, decode, to_ns
 from rtlog_server.topics import BY_NAME
 
 PERIOD_NS = 100_000_000
+CLOCKS_NS = 1_000_000  # by which wall clock and monotonic clock may part while a server runs
 StartServer = Callable[..., Any]
 
 
@@ -37,7 +39,7 @@ def test_ticks_flow_on_the_grid_whatever_the_devices_do(server: Any) -> None:
     scheduled = [to_ns(tick.scheduled) for tick in ticks]
     assert {later - earlier for earlier, later in pairwise(scheduled)} == {PERIOD_NS}
     assert all(min(stamp % PERIOD_NS, -stamp % PERIOD_NS) == 0 for stamp in scheduled)
-    assert abs(time.time_ns() - scheduled[-1]) < 5e9
+    assert server.started_ns < scheduled[0] < scheduled[-1] < time.time_ns()
     for tick in ticks:
         assert {sensor.name: sensor.state for sensor in tick.sensors} == dict.fromkeys(
             ("laser/primary", "encoders", "rfid"), MISSING
@@ -57,16 +59,16 @@ def test_every_sample_says_boot_tick_and_sequence(server: Any) -> None:
     assert diagnostics == list(range(diagnostics[0], diagnostics[0] + len(diagnostics)))
 
 
-def test_heartbeat_tells_the_last_numbers_at_1_hz(server: Any) -> None:
+def test_heartbeats_tell_the_last_numbers(server: Any) -> None:
     server.wait_until(lambda: len(server.on("@heartbeat")) >= 3)
     beats = [json.loads(beat.payload) for beat in server.on("@heartbeat")]
     assert {beat["boot_id"] for beat in beats} == {server.status()["boot_id"]}
-    assert 8 <= beats[-1]["last_tick"] - beats[-2]["last_tick"] <= 12  # the first may come before the first ticks
+    assert beats[-1]["last_tick"] > beats[-2]["last_tick"]  # the first may come before the first ticks
     assert beats[-1]["last_sequence"]["/rtlog/tick"] == beats[-1]["last_tick"]
 
 
 def test_liveliness_token_names_the_boot(server: Any) -> None:
-    replies = server.session.liveliness().get(f"rtlog/{server.name}/@server/*", timeout=5.0)
+    replies = server.session.liveliness().get(f"rtlog/{server.name}/@server/*", timeout=PATIENCE_S)
     keys = [str(reply.ok.key_expr) for reply in replies]
     assert keys == [f"rtlog/{server.name}/@server/{server.status()['boot_id']}"]
 
@@ -96,14 +98,14 @@ def test_status_says_how_the_server_is(server: Any) -> None:
     assert status["devices"]["encoders"]["age_s"] is None
 
 
-def test_diagnostics_at_1_hz_name_what_is_missing(server: Any) -> None:
+def test_diagnostics_name_what_is_missing_each_second_of_ticks(server: Any) -> None:
     server.wait_until(lambda: len(server.on("diagnostics")) >= 2)
     latest = decode(server.on("diagnostics")[-1].payload, BY_NAME["/diagnostics"].msgtype)
     levels = {status.name: status.level for status in latest.status}
     assert levels.keys() == {"laser/primary", "encoders", "rfid", "server"}
     assert levels["encoders"] == levels["rfid"] == levels["laser/primary"] == 2
-    stamps = [to_ns(decode(s.payload, BY_NAME["/diagnostics"].msgtype).header.stamp) for s in server.on("diagnostics")]
-    assert all(0.9e9 < later - earlier < 1.5e9 for earlier, later in pairwise(stamps))
+    ticks = [sample.attachment.tick for sample in server.on("diagnostics")]
+    assert {later - earlier for earlier, later in pairwise(ticks)} == {10}
 
 
 def test_nobody_is_looked_for(server: Any) -> None:
@@ -131,15 +133,16 @@ def test_a_tick_that_was_missed_comes_late_and_says_so(start_server: StartServer
     time.sleep(0.5)
     continued_ns = time.time_ns()
     server.process.send_signal(signal.SIGCONT)
-    server.wait_until(lambda: bool(ticks_of(server)) and to_ns(ticks_of(server)[-1].scheduled) > continued_ns + 3e8)
+    server.wait_until(lambda: to_ns(ticks_of(server)[-1].scheduled) > continued_ns + 3e8)
     ticks = ticks_of(server)
     assert [tick.index for tick in ticks] == list(range(ticks[0].index, ticks[0].index + len(ticks)))
     missed = [tick for tick in ticks if stopped_ns < to_ns(tick.scheduled) < continued_ns]
-    assert len(missed) in (4, 5)
-    for tick in missed:
-        expected_s = (continued_ns - to_ns(tick.scheduled)) * 1e-9
-        assert expected_s <= tick.lateness < expected_s + 0.1
-    assert all(tick.lateness < 0.1 for tick in ticks if to_ns(tick.scheduled) > continued_ns + 1e8)
+    assert len(missed) >= 4
+    began_ns = [to_ns(tick.header.stamp) for tick in missed]
+    assert began_ns == sorted(began_ns)
+    for tick, at_ns in zip(missed, began_ns, strict=True):
+        assert at_ns > continued_ns - CLOCKS_NS
+        assert tick.lateness * 1e9 == pytest.approx(at_ns - to_ns(tick.scheduled), abs=2)
     server.wait_until(lambda: server.status()["ticks"]["overruns"] >= 3)
 
 
@@ -148,13 +151,15 @@ def test_a_publishing_process_that_stands_still_delays_no_tick(start_server: Sta
     server.wait_until(lambda: len(server.on("rtlog/tick")) >= 3)
     publisher = server.publisher_id()
     os.kill(publisher, signal.SIGSTOP)
+    stopped_ns = time.time_ns()
     time.sleep(1.0)
-    os.kill(publisher, signal.SIGCONT)
     continued_ns = time.time_ns()
+    os.kill(publisher, signal.SIGCONT)
     server.wait_until(lambda: to_ns(ticks_of(server)[-1].scheduled) > continued_ns + 2e8)
     ticks = ticks_of(server)
     assert [tick.index for tick in ticks] == list(range(ticks[0].index, ticks[0].index + len(ticks)))
-    assert max(tick.lateness for tick in ticks) < 0.1
+    meanwhile = [tick for tick in ticks if stopped_ns < to_ns(tick.header.stamp) < continued_ns]
+    assert len(meanwhile) >= 3  # none, if the loop had waited for it
     assert server.status()["ticks"]["dropped"] == 0
 
 
@@ -163,11 +168,13 @@ def test_a_signal_ends_it_with_everything_published(start_server: StartServer, n
     server = start_server()
     server.wait_until(lambda: len(server.on("rtlog/tick")) >= 5)
     os.killpg(server.process.pid, number)  # as a terminal or systemd does: to both processes
-    began = time.monotonic()
-    assert server.process.wait(timeout=10) == 0
-    assert time.monotonic() - began < 2.0
-    beat = json.loads(server.on("@heartbeat")[-1].payload)
-    assert beat["last_sequence"]["/rtlog/tick"] == beat["last_tick"] == ticks_of(server)[-1].index
+    assert server.process.wait(timeout=PATIENCE_S) == 0
+
+    def all_is_here() -> bool:
+        beat = json.loads(server.on("@heartbeat")[-1].payload)
+        return beat["last_sequence"]["/rtlog/tick"] == beat["last_tick"] == ticks_of(server)[-1].index
+
+    server.wait_until(all_is_here)
     assert "Traceback" not in server.stderr.read_text()
 
 
@@ -175,7 +182,7 @@ def test_it_does_not_outlive_its_publishing_process(start_server: StartServer) -
     server = start_server()
     server.wait_until(lambda: len(server.on("rtlog/tick")) >= 2)
     os.kill(server.publisher_id(), signal.SIGKILL)
-    assert server.process.wait(timeout=5) == 1
+    assert server.process.wait(timeout=PATIENCE_S) == 1
     last_line = server.stderr.read_text().splitlines()[-1]
     assert last_line == "rtlog-server: the publishing process ended (exit status -9)"
 

@@ -5,6 +5,7 @@ import threading
 import time
 
 import pytest
+from patience import PATIENCE_S, wait_until
 
 from rtlog_server.devices.device import Device, TickGrid
 from rtlog_server.messages import MISSING, OK
@@ -19,7 +20,7 @@ class FaultyOnce(Device):  # type: ignore[type-arg]
 
     def connect(self) -> None:
         if self.failed.is_set():
-            self.may_return.wait(5.0)
+            self.may_return.wait(PATIENCE_S)
 
     def read(self) -> None:
         if not self.failed.is_set():
@@ -37,16 +38,12 @@ def test_a_fault_in_a_driver_is_told_and_survived(caplog: pytest.LogCaptureFixtu
     with caplog.at_level(logging.ERROR):
         device.start(TickGrid(time.monotonic_ns(), 100_000_000))
         try:
-            assert device.failed.wait(5.0)
-            deadline = time.monotonic() + 5.0
-            while "not there" not in device.message and time.monotonic() < deadline:
-                time.sleep(0.01)
+            assert device.failed.wait(PATIENCE_S)
+            wait_until(lambda: "not there" in device.message)
             assert "fault in the driver" in device.message
             assert device.collect(time.monotonic_ns()).state == MISSING
             device.may_return.set()
-            while device.collect(time.monotonic_ns()).state != OK and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert device.collect(time.monotonic_ns()).state == OK
+            wait_until(lambda: device.collect(time.monotonic_ns()).state == OK)
             assert device.connects == 2
         finally:
             device.close()

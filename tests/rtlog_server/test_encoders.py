@@ -8,6 +8,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from patience import PATIENCE_S
 
 from hw_profiles.profile import Encoder
 from rtlog_server.devices.device import TickGrid
@@ -173,7 +174,7 @@ def test_encoders_are_stale_after_three_ticks_but_not_too_soon(period_ms: int, p
     device = Wordless()
     before_ns = time.monotonic_ns()
     device.start(TickGrid(before_ns, period_ms * 1_000_000))
-    assert device.serving.wait(10.0)
+    assert device.serving.wait(PATIENCE_S)
     after_ns = time.monotonic_ns()
     assert device.collect(before_ns + (patience_ms - 1) * 1_000_000).state == OK
     assert device.collect(after_ns + (patience_ms + 1) * 1_000_000).state == STALE

@@ -10,6 +10,7 @@ from pathlib import Path
 from uuid import UUID
 
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.bundle import DeviceReport, LatenessSummary, Report, ServerInfo
 from rtlog_server.health import ReportTimer, diagnostics, notify, status, status_line
@@ -97,17 +98,15 @@ def test_notify_speaks_to_systemd(abstract: bool, tmp_path: Path, monkeypatch: p
     name = f"@rtlog-test-{tmp_path.name}-{time.monotonic_ns()}" if abstract else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(name.replace("@", "\0"))
-        systemd.settimeout(5)
+        systemd.settimeout(PATIENCE_S)
         monkeypatch.setenv("NOTIFY_SOCKET", name)
         notify(f"READY=1\nSTATUS={status_line(REPORT)}")
         lines = systemd.recv(1000).decode().splitlines()
         assert lines[0] == "READY=1"
         late = "600 ticks, 7 dropped, 2 overruns; late by 0.50 ms (p99), 250.00 ms (worst)"
         assert lines[1] == f"STATUS={late}; laser/primary OK, encoders STALE, rfid MISSING"
-        began = time.monotonic()
         for _ in range(1000):
-            notify("WATCHDOG=1")  # nobody reads: the socket fills up
-        assert time.monotonic() - began < 1.0
+            notify("WATCHDOG=1")  # nobody reads: the socket fills up, and this goes on
 
 
 def test_notify_without_systemd_does_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

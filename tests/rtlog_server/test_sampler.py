@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import wait_until
 
 from rtlog_server.bundle import Sample
 from rtlog_server.devices.device import Device, DeviceError, TickGrid
@@ -47,10 +48,7 @@ class HandFed(Device[Any]):
     def go(self, there: bool) -> None:
         """Come or go away, and wait until the frame has noticed."""
         self.there = there
-        deadline = time.monotonic() + 5.0
-        while self.connected != there:
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+        wait_until(lambda: self.connected == there)
 
 
 class Bench:
@@ -63,6 +61,8 @@ class Bench:
         for device in self.devices:
             device.start(grid)
             device.go(there=True)
+        for device in self.devices:
+            device.heard()
         self.start_ns = time.monotonic_ns()
         self.sampler = Sampler(self.devices, UTC_OFFSET_NS)
 

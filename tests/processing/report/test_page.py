@@ -95,7 +95,7 @@ def test_what_was_left_out_is_said(small_atlas: Path, tmp_path: Path) -> None:
 def test_the_verb_writes_a_page_whole_or_not_at_all(small_atlas: Path, tmp_path: Path) -> None:
     def report(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "processing.cli", "report", *arguments]
-        return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+        return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
 
     copy = shutil.copytree(small_atlas, tmp_path / "level.atlas")
     result = report(copy)

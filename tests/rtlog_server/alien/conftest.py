@@ -1,20 +1,17 @@
 """A driver that runs against an emulated ALR-9650, over real sockets and a real pseudo-terminal."""
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S, Told
 
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices.alien.driver import Alr9650
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
 from rtlog_server.devices.device import TickGrid
 from rtlog_server.devices.rfid import TagSample
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, Told
 
 EPCS = [f"E2000016591900781840{number:04X}" for number in range(5)]
 

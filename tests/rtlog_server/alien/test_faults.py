@@ -2,7 +2,6 @@
 
 import os
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -10,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import in_use, left_behind
 
 from hw_profiles.profile import RfidDevice
 from rtlog_server.devices import device
 from rtlog_server.devices.alien import driver
 from rtlog_server.devices.alien.emulator import Alr9650Emulator
 from rtlog_server.messages import MISSING, STALE
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import in_use, left_behind
 
 Start = Callable[..., Any]
 

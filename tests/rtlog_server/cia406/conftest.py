@@ -1,20 +1,18 @@
 """Emulated encoders on a CAN bus, and their driver, collected at each tick."""
 
 import socket
-import sys
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+from wheels import Wheels
 
 from hw_profiles.profile import CanBus, Encoder
+from rtlog_server.devices.cia406 import nodes
 from rtlog_server.devices.cia406.driver import Cia406Encoders
 from rtlog_server.devices.cia406.emulator import CanBusEmulator
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from wheels import Wheels
 
 COUNTS = 4096
 PERIOD_NS = 40_000_000
@@ -66,8 +64,9 @@ def emulate(turning: Callable[[int, int], int]) -> Callable[..., CanBusEmulator]
 
 
 @pytest.fixture
-def start(start_encoders: Callable[..., Any]) -> Callable[..., Any]:
-    """Starts a driver of the bus."""
+def start(start_encoders: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Starts a driver of the bus; on a busy machine heartbeats may come late, and no node is to be lost by that."""
+    monkeypatch.setattr(nodes, "LOST_NS", 1_500_000_000)
 
     def start_bus(bus: CanBus, encoders: tuple[Encoder, ...] = ENCODERS) -> Any:
         return start_encoders(Cia406Encoders("encoders", bus, encoders), PERIOD_NS)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import can
 import pytest
+from patience import PATIENCE_S
 
 from hw_profiles.profile import CanBus
 from rtlog_server.devices.cia406.port import CanPort
@@ -34,11 +35,11 @@ def port(line: can.BusABC) -> Iterator[CanPort]:
 def test_frames_go_out_and_come_in_with_the_time_of_their_arrival(port: CanPort, line: can.BusABC) -> None:
     before_ns = time.monotonic_ns()
     assert before_ns <= port.send(Frame(0x605, b"\x40\x00")) <= time.monotonic_ns()
-    sent = line.recv(5.0)
+    sent = line.recv(PATIENCE_S)
     assert sent is not None
     assert (sent.arbitration_id, bytes(sent.data), sent.is_extended_id) == (0x605, b"\x40\x00", False)
     line.send(can.Message(arbitration_id=0x285, data=b"\x01\x02", is_extended_id=False))
-    received = port.receive(5.0)
+    received = port.receive(PATIENCE_S)
     assert received is not None
     frame, arrived_ns = received
     assert frame == Frame(0x285, b"\x01\x02")
@@ -58,8 +59,8 @@ def test_frames_go_out_and_come_in_with_the_time_of_their_arrival(port: CanPort,
 def test_other_kinds_of_frames_are_none_of_ours(message: can.Message, port: CanPort, line: can.BusABC) -> None:
     line.send(message)
     line.send(can.Message(arbitration_id=0x705, data=b"\x05", is_extended_id=False))
-    assert port.receive(5.0) is None
-    received = port.receive(5.0)
+    assert port.receive(PATIENCE_S) is None
+    received = port.receive(PATIENCE_S)
     assert received is not None
     assert received[0].can_id == 0x705
 
@@ -71,14 +72,14 @@ def error_frame(classes: int, data: bytes = bytes(8)) -> can.Message:
 def test_the_controllers_reports_are_kept_and_bus_off_is_a_failure(port: CanPort, line: can.BusABC) -> None:
     assert port.controller == "ok"
     line.send(error_frame(0x04, b"\x00\x20" + bytes(6)))
-    assert port.receive(5.0) is None
+    assert port.receive(PATIENCE_S) is None
     assert port.controller == "error passive"
     line.send(error_frame(0x04, b"\x00\x40" + bytes(6)))
-    assert port.receive(5.0) is None
+    assert port.receive(PATIENCE_S) is None
     assert port.controller == "ok"
     line.send(error_frame(0x40))
     with pytest.raises(DeviceError, match=r"virtual:\w+: bus-off: cable, terminators, bit rate"):
-        port.receive(5.0)
+        port.receive(PATIENCE_S)
 
 
 def test_a_closed_bus_is_lost(port: CanPort) -> None:
@@ -99,13 +100,11 @@ def test_an_slcan_adapter_passes_nothing_on_until_it_is_opened(tmp_path: Path) -
     while adapter.receive(0.05) is not None:
         pass
     adapter.send(Frame(0x285, b"\xab\xcd"))
-    deadline = time.monotonic() + 5.0
     received = None
-    while received is None and time.monotonic() < deadline:
+    while received is None:
         adapter.receive(0.0)  # the commands that open it
         adapter.send(Frame(0x285, b"\xab\xcd"))
         received = port.receive(0.05)
-    assert received is not None
     assert received[0] == Frame(0x285, b"\xab\xcd")
     adapter.close()
     assert not (tmp_path / "slcan").is_symlink()

@@ -69,10 +69,8 @@ def test_a_number_of_many_bytes_is_none() -> None:
 
 def test_segments_without_an_end_are_cut_off() -> None:
     endless = itertools.chain(["41 08 10 00 FF FF FF FF"], itertools.cycle(["00" + "41" * 7, "10" + "41" * 7]))
-    began = time.monotonic()
     with pytest.raises(NodeSilentError):
         Script(endless).objects.read_text((0x1008, 0))
-    assert time.monotonic() - began < 20.0
 
 
 def test_objects_are_named_as_manuals_do() -> None:

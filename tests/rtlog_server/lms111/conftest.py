@@ -1,15 +1,14 @@
 """An emulated scanner that measures, a driver in its thread, and what a tick thread collects from it."""
 
 import math
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import Told, wait_until
 
 from hw_profiles.profile import LaserDevice
 from rtlog_server.devices.device import TickGrid
@@ -18,9 +17,6 @@ from rtlog_server.devices.lms111 import driver
 from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.messages import MISSING
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import Told, wait_until
 
 ROUNDED_NS = 300_000  # what a clock that drifts by 100 ppm, and counts microseconds, may be off by in some seconds
 
@@ -158,4 +154,5 @@ def feed() -> Iterator[Callable[..., Feeder]]:
     yield feed
     for feeder in feeders:
         feeder.stop()
+    for feeder in feeders:  # several may have fed one
         feeder.emulator.close()

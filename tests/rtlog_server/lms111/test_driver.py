@@ -1,20 +1,16 @@
 """The driver against an emulated scanner, on real sockets: what comes out is what was measured."""
 
 import math
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S, wait_until
 
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.messages import MISSING, OK
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, wait_until
 
 Open = Feed = Callable[..., Any]
 

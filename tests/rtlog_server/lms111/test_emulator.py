@@ -2,23 +2,19 @@
 
 import random
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S
 
 from rtlog_server.devices.lms111.cola import Dialect, Receiver, frame
 from rtlog_server.devices.lms111.emulated_sweep import quantise_ranges
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.lms111.protocol import AUTHORISED_CLIENT, Command, decode, encode_command
 from rtlog_server.devices.lms111.scan_data import ScanData
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S
 
 MS = 1_000_000
 STEP_RAD = np.radians(0.5)

@@ -1,13 +1,12 @@
 """The driver and all that can happen to a scanner: when it is back, so is the driver, and nothing is left behind."""
 
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S, in_use, left_behind, wait_until
 
 from rtlog_server.devices import device
 from rtlog_server.devices.lms111 import connection, driver
@@ -16,9 +15,6 @@ from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.devices.lms111.protocol import ERRORS
 from rtlog_server.devices.lms111.scan_data import Channel, ScanData, encode_scan_data
 from rtlog_server.messages import MISSING
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, in_use, left_behind, wait_until
 
 Open = Feed = Callable[..., Any]
 

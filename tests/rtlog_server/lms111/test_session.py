@@ -3,7 +3,6 @@
 import json
 import random
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S, Told, wait_until
 
 from hw_profiles.profile import LaserDevice
 from rtlog_server.devices import lms111
@@ -24,9 +24,6 @@ from rtlog_server.devices.lms111.driver import Lms111
 from rtlog_server.devices.lms111.identity import identify
 from rtlog_server.devices.lms111.protocol import Command, decode, encode_command, reply_name
 from rtlog_server.devices.lms111.scan_data import ScanData, encode_scan_data
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import PATIENCE_S, Told, wait_until
 
 CAPTURES = Path(__file__).parents[4] / "shared" / "data" / "lms111"
 needs_captures = pytest.mark.skipif(not CAPTURES.is_dir(), reason=f"no captured sessions in {CAPTURES}")

@@ -1,21 +1,17 @@
 """One server with a scanner ahead and one behind, of different dialect, rate, resolution and echo."""
 
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import wait_until
 
 from rtlog_server.devices.lms111.emulator import Lms111Emulator
 from rtlog_server.messages import MISSING, OK, decode, to_ns
 from rtlog_server.ticker import utc_offset_ns
 from rtlog_server.topics import AUXILIARY_SCAN, PRIMARY_SCAN, TICK
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import wait_until
 
 AUXILIARY = """
 [lasers.auxiliary]

@@ -1,17 +1,14 @@
 """A driver that runs against emulated encoders, over a real pseudo-terminal."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from wheels import Wheels
 
 from hw_profiles.profile import Encoder, SeiBus
 from rtlog_server.devices.sei.driver import SeiEncoders
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from wheels import Wheels
 
 COUNTS = 4096
 PERIOD_NS = 33_300_000  # no multiple of the 4 ms in which an encoder looks at its disc

@@ -4,21 +4,18 @@ import fcntl
 import itertools
 import os
 import random
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import in_use, left_behind
 
 from rtlog_server.devices import device
 from rtlog_server.devices.sei import driver, protocol
 from rtlog_server.devices.sei.emulator import SeiBusEmulator
 from rtlog_server.messages import MISSING
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import in_use, left_behind
 
 COUNTS = 4096
 GAP_NS = 200_000_000
