@@ -78,6 +78,7 @@ def fit_sensor(run: Run, pairs: LaserPairs) -> SensorFit:
         value, sigma, cost = _fit(run, pairs, free)
         value[0] = _without_lag(value[0], run)
         proven = (np.abs(value) > np.maximum(SIGNIFICANT * sigma, _floors())) & (sigma < _sure())
+        proven[SENSOR:] = True  # the wheels' are never left out
         if np.all(proven[free]) or not free[:SENSOR].any():
             used = free[:SENSOR]
             return SensorFit(np.where(used, value[:SENSOR], 0.0), sigma[:SENSOR], used, cost)
