@@ -117,7 +117,7 @@ def test_a_few_reads_from_elsewhere_are_thin_at_any_speed() -> None:
     walk, fast = straight(200, 0.1), straight(200, 1.0)
     stop = straight(200, 0.2)
     stop[50:120, 0] = stop[50, 0]
-    slow = passes_of({A: [*range(40, 80)], B: [20]}, walk)
+    slow = passes_of({A: [*range(40, 80)], B: [*range(10, 30)]}, walk)
     quick = passes_of({A: [100, 101, 102, 103, 150, 151]}, fast)
     stood = passes_of({A: [*range(40, 131)]}, stop)
     thin = thin_passes([slow, quick, stood])
