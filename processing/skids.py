@@ -37,8 +37,9 @@ def without_skids(motions: Motions, seconds: Array) -> Motions:
     guessed = _impossible(motions.deltas, velocities)
     if has_pace(seconds):
         changes = np.abs(np.diff(velocities[:, [0, 2]], axis=0))
-        usual = np.median(changes[np.abs(velocities[1:, 0]) > MOVES_M_S], axis=0) if len(changes) else np.zeros(2)
-        off = np.array([OFF_M_S, OFF_RAD_S]) + NOISE * np.nan_to_num(usual, nan=0.0)
+        changes = changes[np.abs(velocities[1:, 0]) > MOVES_M_S]
+        usual = np.median(changes, axis=0) if len(changes) else np.zeros(2)
+        off = np.array([OFF_M_S, OFF_RAD_S]) + NOISE * usual
         _find_skids(velocities, seconds, off, guessed)
     if not guessed.any():
         return motions

@@ -40,7 +40,7 @@ def test_one_epc_at_two_places_is_left_out(driven: list[DrivenRun], swapped: boo
 
 def test_a_tag_that_rides_along_is_no_beacon(driven: list[DrivenRun]) -> None:
     epc, count = "E200000000000000000000FF", len(driven[0].loop)
-    rider = Pass(epc, driven[0].loop.keyframes[50], 0, count - 1, 0.0, 0.0, 10.0)
+    rider = Pass(epc, driven[0].loop.keyframes[50], 0, count - 1, 0.0, 0.0, 10.0, read_m=200.0)
     runs, left_out = leave_out_moved([replace(driven[0], passes=[rider, *driven[0].passes]), driven[1]])
     assert [(item["what"], item["run"]) for item in left_out] == [(f"tag {epc}", "small-around")]
     assert left_out[0]["reason"].endswith("it rides along")
