@@ -79,8 +79,8 @@ def fit_sensor(run: Run, pairs: LaserPairs) -> SensorFit:
         value[0] = _without_lag(value[0], run)
         proven = (np.abs(value) > np.maximum(SIGNIFICANT * sigma, _floors())) & (sigma < _sure())
         proven[SENSOR:] = True  # the wheels' are never left out
-        if np.all(proven[free]) or not free[:SENSOR].any():
-            used = free[:SENSOR]
+        if np.all(proven[free]) or not proven[:SENSOR].any():
+            used = free[:SENSOR] & proven[:SENSOR]
             return SensorFit(np.where(used, value[:SENSOR], 0.0), sigma[:SENSOR], used, cost)
         # the least proven goes first: what it took from the others comes back to them
         doubt = np.where(free & ~proven, np.abs(value) / np.maximum(sigma, _floors()), np.inf)
