@@ -16,7 +16,7 @@ from processing.read_log import Run
 
 Array = NDArray[np.float64]
 
-LEAST_S, MOST = 0.003, 0.3  # less scatter does no harm; more, as a share of the pace, leaves no pace to be seen
+LEAST_S, MOST = 0.003, 0.4  # less scatter does no harm; more, as a share of the pace, leaves no pace to be seen
 SLOW = 101  # samples over which a clock may run fast or slow
 FIRST = 32  # samples from which the pace is first told
 
