@@ -13,21 +13,26 @@ from numpy.typing import NDArray
 
 from processing.chain import Contradiction
 from processing.geometry import accumulate, relative
+from processing.sensor_calibration import SIGNIFICANT
 
 if TYPE_CHECKING:
     from processing.pipeline import DrivenRun
 
 Array = NDArray[np.float64]
 
+WORTH_TELLING = 0.02  # every tyre is worn by a percent
 TOGETHER_S = 2.0  # a pause between contradictions that is shorter belongs to the stretch
 
 
 def convictions(driven: "DrivenRun") -> list[dict[str, Any]]:
     """Those of a run, in order."""
     times, ticks, poses = driven.run.scans.times, driven.run.scan_ticks, driven.loop.poses
-    whole = [int(ticks[0]), int(ticks[-1])]
+    whole, scale = [int(ticks[0]), int(ticks[-1])], driven.wheels.scale
+    wrong = list(driven.put_right)
+    if abs(scale - 1) > max(WORTH_TELLING, SIGNIFICANT * driven.wheels.sigma):
+        wrong.append(f"the wheels' way off by {100 * (1 - scale):.1f} ± {100 * driven.wheels.sigma:.1f} %")
     out: list[dict[str, Any]] = [
-        {"run": driven.run.run_id, "ticks": whole, "what": "profile", "how_much": line} for line in driven.put_right
+        {"run": driven.run.run_id, "ticks": whole, "what": "profile", "how_much": line} for line in wrong
     ]
     out += [_tell_skid(driven, int(a), int(b)) for a, b in _stretches_of(driven.loop.odometry.guessed)]
     for convicts_wheels in (True, False):
