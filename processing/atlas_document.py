@@ -48,11 +48,17 @@ def assemble_atlas(
         ],
         "nodes": [_node(k, runs, graph, placement) for k in range(len(graph.nodes))],
         "edges": [_edge(piece, runs, placement) for piece in placement.pieces],
-        "convictions": [of for driven in runs for of in convictions(driven)],
+        "convictions": [of for driven in runs for of in convictions(driven)] + [_of_tag(item) for item in left_out],
         "left_out": left_out,
         "remarks": remarks,
     }
     return Atlas(document, trajectories)
+
+
+def _of_tag(item: dict[str, Any]) -> dict[str, Any]:
+    """What was left out of a run, as a conviction of the tag."""
+    ends = [min(item["ticks"]), max(item["ticks"])]
+    return {"run": item["run"], "ticks": ends, "what": "tag", "how_much": f"{item['what']}: {item['reason']}"}
 
 
 def _metres(value: float) -> float:

@@ -16,6 +16,7 @@ def caveats(document: Mapping[str, Any]) -> dict[str, list[str]]:
             f"run {found['run']}, ticks {found['ticks'][0]} to {found['ticks'][1]}: "
             f"{found['what']} not believed, {found['how_much']}"
             for found in document.get("convictions", [])
+            if found["what"] != "tag"  # what is left out says it
         ],
         "left_out": [
             f"{item['what']} is left out of run {item['run']}, ticks {', '.join(map(str, item['ticks']))}: "
@@ -37,7 +38,7 @@ def rests_on_little(document: Mapping[str, Any]) -> list[str]:
     ]
     for part in sorted(parts):
         out += _hanging_on_one_tag(document, part)
-    stretches = len(document.get("convictions", []))
+    stretches = sum(found["what"] in ("wheels", "scan") for found in document.get("convictions", []))
     return out + ([f"{stretches} stretch{'es' * (stretches > 1)} not believed"] if stretches else [])
 
 

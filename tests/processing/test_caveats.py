@@ -58,7 +58,8 @@ def test_what_one_tag_joins_is_named(passed: dict[str, list[str]], hanging: list
 
 
 def test_parts_unused_scans_and_what_was_not_believed_are_named() -> None:
-    found = document({"a": ["E1", "E2"], "b": ["E1", "E2"]}, {"a": 0, "b": 1}, convictions=[{}, {}])
+    convictions = [{"what": of} for of in ("wheels", "scan", "profile", "tag")]
+    found = document({"a": ["E1", "E2"], "b": ["E1", "E2"]}, {"a": 0, "b": 1}, convictions=convictions)
     found["runs"][1]["scans_unused"] = 101
     assert rests_on_little(found) == [
         "2 parts that nothing joins",
