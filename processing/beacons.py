@@ -77,9 +77,9 @@ def _apart(centres: Ints, count: int) -> Ints:
     return np.minimum(moved, count - len(centres) + rank)
 
 
-def thin_passes(runs: Sequence[Sequence[Pass]]) -> list[list[Pass]]:
-    """Of each run the passes whose clouds are thin beside the others of their tag: a few reads from far down the drift,
-    or through rock from the drift beside.
+def thin_passes(runs: Sequence[Sequence[Pass]], counts: Sequence[int]) -> list[list[Pass]]:
+    """Of each run, of so many poses, the passes whose clouds are thin beside the others of their tag: a few reads from
+    far down the drift, or through rock from the drift beside. A cloud that a run begins or ends in is cut off.
     """
     lengths_m: dict[str, list[float]] = defaultdict(list)
     for found in (found for passes in runs for found in passes):
@@ -87,7 +87,12 @@ def thin_passes(runs: Sequence[Sequence[Pass]]) -> list[list[Pass]]:
     every_m = [length_m for of in lengths_m.values() for length_m in of]
     least_m = THINNEST * float(np.median(every_m)) if every_m else 0.0  # a tag beyond the rock may have no pass at all
     usual_m = {epc: float(np.quantile(of, 0.75)) for epc, of in lengths_m.items()}
-    return [[found for found in passes if found.read_m < max(THIN * usual_m[found.epc], least_m)] for passes in runs]
+
+    def is_thin(found: Pass, count: int) -> bool:
+        cut_off = found.first < MAX_GAP_POSES or found.last >= count - MAX_GAP_POSES
+        return found.read_m < (least_m if cut_off else max(THIN * usual_m[found.epc], least_m))
+
+    return [[of for of in passes if is_thin(of, count)] for passes, count in zip(runs, counts, strict=True)]
 
 
 def overlapping_passes(passes: list[Pass]) -> list[tuple[Pass, Pass]]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def leave_out_moved(runs: list["DrivenRun"]) -> tuple[list["DrivenRun"], list[dict[str, Any]]]:
     """The runs without reads from elsewhere and without tags that are at no one place, and what to tell of these."""
-    thin = thin_passes([run.passes for run in runs])
+    thin = thin_passes([run.passes for run in runs], [len(run.loop) for run in runs])
     left_out = [
         _left_out(run, found.epc, [found], ELSEWHERE) for run, of in zip(runs, thin, strict=True) for found in of
     ]

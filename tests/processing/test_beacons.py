@@ -120,9 +120,16 @@ def test_a_few_reads_from_elsewhere_are_thin_at_any_speed() -> None:
     slow = passes_of({A: [*range(40, 80)], B: [*range(10, 30)]}, walk)
     quick = passes_of({A: [100, 101, 102, 103, 150, 151]}, fast)
     stood = passes_of({A: [*range(40, 131)]}, stop)
-    thin = thin_passes([slow, quick, stood])
+    thin = thin_passes([slow, quick, stood], [200] * 3)
     assert [[(found.epc, found.first) for found in of] for of in thin] == [[], [(A, 150)], []]
 
 
 def test_a_tag_that_was_read_once_is_never_thin() -> None:
-    assert thin_passes([passes_of({A: [5], B: [50, 51, 52]}, straight(100))]) == [[]]
+    assert thin_passes([passes_of({A: [45], B: [50, 51, 52]}, straight(100))], [100]) == [[]]
+
+
+def test_a_cloud_that_a_run_begins_or_ends_in_is_cut_off_not_thin() -> None:
+    whole, cut = passes_of({A: [*range(40, 80)]}, straight(200)), passes_of({A: [*range(12)]}, straight(200))
+    assert thin_passes([whole, cut], [200, 200]) == [[], []]
+    late = passes_of({A: [*range(60, 72)]}, straight(200))
+    assert thin_passes([whole, late], [200, 200]) == [[], late]
