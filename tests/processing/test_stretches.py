@@ -1,42 +1,21 @@
 """Stretches around a tag: what two drives saw of one drift agrees, and of the wrong way round only where it tells."""
 
-from collections.abc import Sequence
-from itertools import pairwise
-
 import numpy as np
 import pytest
+from made_scans import look, walls
 from numpy.testing import assert_allclose
 
 from processing.geometry import compose, inverse, relative
-from processing.scan_walls import Scan, prepare_scan
-from processing.simulation.raycast import SegmentGrid, build_grid, cast
 from processing.stretches import REACH_M, SPACING_M, Stretch, contradiction, stretch_of, stretch_rows
 
-ANGLES = np.radians(np.linspace(-135, 135, 361))
-MOUNT = np.array([-0.6, 0.1, np.pi])
 WAY = np.arange(-44, 46, 2.0)  # the tag hangs at 0
 AHEAD = np.column_stack([WAY, np.zeros(45), np.zeros(45)])
 AROUND = np.column_stack([np.minimum(WAY, 30), np.maximum(WAY - 30, 0), np.where(WAY > 30, np.pi / 2, 0.0)])
 TURNED = np.array([0.0, 0.0, np.pi])
 
 
-def walls(*lines: Sequence[tuple[float, float]]) -> SegmentGrid:
-    pieces = []
-    for a, b in (pair for line in lines for pair in pairwise(np.array(line, float))):
-        points = a + np.linspace(0, 1, int(np.hypot(*(b - a)) / 0.5) + 2)[:, None] * (b - a)
-        pieces.append(np.hstack([points[:-1], points[1:]]))
-    return build_grid(np.concatenate(pieces))
-
-
 STRAIGHT = walls([(-90, -2.2), (90, -2.2)], [(-90, 2.2), (90, 2.2)])
 BENT = walls([(-90, -2.2), (32.2, -2.2), (32.2, 60)], [(-90, 2.2), (27.8, 2.2), (27.8, 60)])
-
-
-def look(world: SegmentGrid, pose: np.ndarray, seed: int) -> Scan:
-    laser, rng = compose(pose, MOUNT), np.random.default_rng(seed)
-    ranges = cast(world, np.tile(laser[:2], (len(ANGLES), 1)), laser[2] + ANGLES, 20.0) + rng.normal(0, 0.01, 361)
-    points = np.where(np.isfinite(ranges), ranges, np.nan)[:, None] * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
-    return prepare_scan(points, ANGLES[0], ANGLES[1] - ANGLES[0], MOUNT)
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["straight", "bent"])

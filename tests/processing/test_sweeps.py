@@ -29,7 +29,7 @@ def test_a_step_that_no_vehicle_makes_bends_no_sweep(jump: list[float]) -> None:
 
 def test_times_squeezed_together_make_nobody_fast() -> None:
     times = TIMES.copy()
-    times[10:15] = times[9] + 1e-4 * np.arange(1, 6)
+    times[10:15] = times[9] + 0.02 * np.arange(1, 6)  # 10 m/s
     assert np.abs(velocities_of(ROLLING, times)[:, 0]).max() <= 2 * 2.0 + 1e-9
 
 
