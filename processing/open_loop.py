@@ -24,7 +24,7 @@ from processing.geometry import accumulate, compose, interpolate_poses, relative
 from processing.odometry import Motions, odom_motions, wheel_motions
 from processing.pose_graph import Links
 from processing.read_log import Run
-from processing.scan_matching import Matcher
+from processing.scan_matching import LEVER_M, Matcher
 from processing.skids import has_pace, without_skids
 from processing.sweeps import StoredScans, Sweeps, velocities_of
 
@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SEGMENT_SCANS = 1500
+BENT_M = 0.02  # sweeps bent by more see a motion along a smooth drift that is none
 # What /odom of an unknown robot may be trusted with.
 FOREIGN_NOISE = OdometryNoise(
     distance_m_per_sqrt_m=0.06, lateral_m_per_sqrt_m=0.03, heading_deg_per_sqrt_m=3.0, heading_deg_per_sqrt_deg=1.0
@@ -138,17 +139,25 @@ def cut_segments(sweeps: Sweeps, odometry: Motions, forced: Ints) -> list[Segmen
 
 
 def drive_segment(segment: Segment, match: Matcher) -> DrivenSegment:
-    """Drive through it; a second time where wheels were convicted, for they bent the sweeps too."""
+    """Drive through it; a second time where wheels that slipped have bent the sweeps, for bent walls lie."""
     driven = _drive(segment, match)
-    if any(found.convicts_wheels for found in driven.contradictions):
-        poses = compose(accumulate(np.zeros(3), driven.motions)[driven.reference], driven.offsets)
-        driven = _drive(replace(segment, sweeps=straighten_by(segment.sweeps, poses)), match)
+    poses = compose(accumulate(np.zeros(3), driven.motions)[driven.reference], driven.offsets)
+    straight = straighten_by(segment.sweeps, poses)
+    if np.any(_bent(segment.sweeps, straight.velocities) > BENT_M):
+        driven = _drive(replace(segment, sweeps=straight), match)
     return driven
 
 
 def straighten_by(sweeps: Sweeps, poses: Array) -> Sweeps:
     """The sweeps, straightened by the motions between these poses (n, 3)."""
     return replace(sweeps, velocities=velocities_of(relative(poses[:-1], poses[1:]), sweeps.times))
+
+
+def _bent(sweeps: Sweeps, velocities: Array) -> Array:
+    """How far (n,) m the end of a sweep lies from where it would with these velocities (n, 3) of the vehicle."""
+    off = np.abs(velocities - sweeps.velocities)
+    sweep_s = abs(sweeps.time_increment_s) * (sweeps.ranges.shape[1] - 1)
+    return np.asarray((np.hypot(off[:, 0], off[:, 1]) + LEVER_M * off[:, 2]) * sweep_s)
 
 
 def _drive(segment: Segment, match: Matcher) -> DrivenSegment:

@@ -64,6 +64,15 @@ def test_wheels_that_lie_are_convicted_where_the_walls_are_rough(tmp_path: Path,
     assert max(of["ticks"][1] for of in told) < 230
 
 
+@pytest.mark.parametrize("kind", ["odometry_missing", "stuck"])
+def test_odometry_that_ends_or_freezes_leaves_the_rest_to_the_walls(tmp_path: Path, kind: str) -> None:
+    driven, true = drive(tmp_path, f'{{ kind = "{kind}", at_s = 12.0, for_s = 600.0 }}')
+    assert np.hypot(*end_error(driven, true)[:2]) < 0.15
+    wheels = [of["ticks"] for of in convictions(driven) if of["what"] == "wheels"]
+    assert wheels[0][0] == pytest.approx(120, abs=5)
+    assert wheels[-1][1] > driven.run.scan_ticks[-1] - 60  # by then the vehicle stands, as the wheels say
+
+
 def test_nobody_is_convicted_of_an_honest_drive(tmp_path: Path) -> None:
     driven, true = drive(tmp_path)
     assert convictions(driven) == []

@@ -66,5 +66,5 @@ def test_a_truck_that_drives_ahead_objects_alone_and_is_not_heard() -> None:
 def test_a_scan_of_almost_nothing_objects_to_nothing() -> None:
     walls = drift(0.15)
     few = look(walls, 0.4, 2).points.copy()
-    few[25:] = np.nan
+    few[np.arange(len(few)) % 90 > 5] = np.nan  # a few beams here and there
     assert objection(look(walls, 0.0, 1), prepare_scan(few, ANGLES[0], ANGLES[1] - ANGLES[0]), MOVED, np.zeros(3)) == 0

@@ -215,13 +215,18 @@ def test_a_matcher_that_lies_is_not_believed(driven: list[DrivenRun], truth: lis
     assert errors_over(10, loop.poses, truth[0][:200])[0] < 0.05
 
 
+def drive_smooth(folder: Path, more: str = "") -> tuple[Run, np.ndarray]:
+    """The run between smooth walls, and the true pose (n, 3) of every scan."""
+    (folder / "smooth.toml").write_text(SMOOTH + more, encoding="utf-8")
+    simulate(folder / "smooth.toml", folder / "smooth")
+    run = read_log(folder / "smooth" / "smooth-out.mcap")
+    stamps, true = read_tum(folder / "smooth" / "smooth-out.tum")
+    return run, true[np.searchsorted(stamps, run.scans.stamps_ns)]
+
+
 def test_along_a_smooth_drift_the_wheels_decide(tmp_path: Path) -> None:
     """35 m of which the laser sees nothing: the length is that of the wheels, not shorter, and its doubt is theirs."""
-    (tmp_path / "smooth.toml").write_text(SMOOTH, encoding="utf-8")
-    simulate(tmp_path / "smooth.toml", tmp_path / "smooth")
-    run = read_log(tmp_path / "smooth" / "smooth-out.mcap")
-    stamps, true = read_tum(tmp_path / "smooth" / "smooth-out.tum")
-    true = true[np.searchsorted(stamps, run.scans.stamps_ns)]
+    run, true = drive_smooth(tmp_path)
     loop = estimate_open_loop(run, NOBODY)
     end, blind = relative(true[0], true[-1]), dead_reckon(loop.odometry)[-1]
     fused, driven_m = loop.poses[-1], end[0]
@@ -234,6 +239,15 @@ def test_along_a_smooth_drift_the_wheels_decide(tmp_path: Path) -> None:
     moving = np.hypot(*loop.links.motions[:, :2].T) > 0.3
     assert np.all(covariances[moving, 0, 0] > 0.05 * wheels[moving, 0, 0])
     assert np.all(covariances[moving, 1, 1] < 1e-4)
+
+
+def test_a_slip_between_smooth_walls_holds_nobody_back(tmp_path: Path) -> None:
+    """It bends the sweeps, and bent walls see a motion along the drift: but for the second drive, the vehicle stays."""
+    slip = 'hazards = [{ kind = "slip", at_s = 8.0, wheel = "left_wheel", factor = 1.6 }]'
+    run, true = drive_smooth(tmp_path, slip)
+    moved = relative(relative(true[0], true[-1]), relative(*estimate_open_loop(run, NOBODY).poses[[0, -1]]))
+    assert 0.5 < moved[0] < 1.2  # 0.9 m too far, as the wheels counted: no wall contradicts that
+    assert abs(moved[2]) < np.radians(0.3)
 
 
 def test_the_mount_is_that_of_the_profile(driven: list[DrivenRun]) -> None:

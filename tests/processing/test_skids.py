@@ -25,6 +25,10 @@ def test_a_drive_without_skids_is_the_same() -> None:
     assert mend(deltas).guessed is None
 
 
+def test_a_vehicle_that_stands_has_none() -> None:
+    assert mend(np.zeros((COUNT, 3))).guessed is None
+
+
 @pytest.mark.parametrize("extra_m_s", [-2.0, 1.5])
 def test_wheels_that_lock_or_spin_for_a_second_are_filled_in(extra_m_s: float) -> None:
     deltas = rolling()
