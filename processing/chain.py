@@ -109,7 +109,9 @@ class Chain:
         result = self._match(scan, join(self.offset, step))
         if _is_good(result):
             walls = self._motion_of(result)
-            agrees, *fused = fuse(wheels.pose, wheels.covariance, 1.0, walls.pose, walls.covariance)
+            # at an uneven pace the views differ too much for walls to object to little
+            gate = 1.0 if self.is_even else GATE
+            agrees, *fused = fuse(wheels.pose, wheels.covariance, gate, walls.pose, walls.covariance)
             if agrees:
                 self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
                 return True
