@@ -113,6 +113,7 @@ class Chain:
             gate = 1.0 if self.is_even else GATE
             agrees, *fused = fuse(wheels.pose, wheels.covariance, gate, walls.pose, walls.covariance)
             if agrees:
+                self.suspect_s = 0.0
                 self._arrive(k, Motion(*fused), wheels, result.overlap, seconds)
                 return True
         onward = self._onward(step, seconds)
@@ -124,14 +125,15 @@ class Chain:
         best = max(possible or good, key=agreement)
         return self._judge(k, scan, best, bool(possible), wheels, step, onward, seconds)
 
-    def _are_suspect(self, step: Array, onward: Array, seconds: float) -> bool:
-        """Do the wheels say what the vehicle can hardly have done? Not for long: it may be the motion so far that is
-        wrong; but wheels that do not turn at all may be stuck.
-        """
-        still = Motion(join(self.offset, step), np.zeros((3, 3)))
-        self.suspect_s = 0.0 if self._is_possible(still, onward, seconds) else self.suspect_s + seconds
+    def _suspected_for(self, step: Array, onward: Array, seconds: float) -> float:
+        """For how long the wheels have said what the vehicle can hardly have done, this step included [s]."""
+        by_wheels = Motion(join(self.offset, step), np.zeros((3, 3)))
+        return 0.0 if self._is_possible(by_wheels, onward, seconds) else self.suspect_s + seconds
+
+    def _are_suspect(self, step: Array, suspect_s: float) -> bool:
+        """Not for long: it may be the motion so far that is wrong; but wheels that do not turn at all may be stuck."""
         stuck = math.hypot(step[0], step[1]) < STUCK_M and abs(step[2]) < STUCK_RAD
-        return self.is_even and (0 < self.suspect_s < SUSPECT_S or (self.suspect_s > 0 and stuck))
+        return self.is_even and (0 < suspect_s < SUSPECT_S or (suspect_s > 0 and stuck))
 
     def find(self, k: int, scan: Scan, step: Array, noise: Array, seconds: float) -> bool:
         """The same by a search around where the wheels say; what had to be searched for convicts nobody."""
@@ -167,7 +169,8 @@ class Chain:
         honest = _honest_share(missed, wheels.covariance)
         poses = (to_laser(self.mount, self.mount, pose) for pose in (demanded, wheels.pose + honest))
         against = objection(self.scan, scan, *poses) if possible else -1.0
-        if possible and against >= -OBJECTS and self._are_suspect(step, onward, seconds):
+        suspect_s = self._suspected_for(step, onward, seconds)
+        if possible and against >= -OBJECTS and self._are_suspect(step, suspect_s):
             against = max(against, OBJECTS)  # what only a part of the view says is enough then
         within, *fused = fuse(wheels.pose, wheels.covariance, GATE, walls.pose, walls.covariance)
         if np.allclose(honest, missed) or (within and NEUTRAL <= against < OBJECTS):
@@ -190,6 +193,7 @@ class Chain:
             # from here on the wheels count from where the walls put the vehicle
             slipped = wheels.covariance + np.outer(missed, missed) + np.diag(np.square(SLIPPED))
             self._arrive(k, Motion(*fused), Motion(fused[0], slipped), result.overlap, seconds)
+        self.suspect_s = suspect_s
         if not within:
             self.contradictions.append(Contradiction(k, against >= OBJECTS, missed))
         return True

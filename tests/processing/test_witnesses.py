@@ -118,6 +118,16 @@ def test_wheels_that_stop_at_once_have_no_benefit_of_the_doubt(is_even: bool) ->
     assert_offset(chain, (STEPS - 1 + is_even) * STEP[0])
 
 
+def test_suspicion_of_the_wheels_ends_when_they_agree_with_the_walls_again() -> None:
+    """Three seconds of it are too long for a slip; but those of long ago do not count."""
+    world = walls(*SIDES, roughness_m=0.022)
+    chain = drive(world, is_even=True)
+    chain.suspect_s = 2.95
+    assert chain.advance(STEPS, seen(world, STEPS), STEP, NOISE, 0.1)
+    assert chain.advance(STEPS + 1, seen(world, STEPS + 1), 0.1 * STEP, NOISE, 0.1)
+    assert [of.convicts_wheels for of in chain.contradictions] == [True]
+
+
 def test_wheels_that_were_a_little_off_are_doubted_along_the_way_too() -> None:
     """One wheel that slips turns the vehicle and counts half of it as way; nothing of it is worth telling."""
     turned, chain = np.array([0.0, 0.0, 0.012]), drive(SMOOTH, is_even=True)
