@@ -23,6 +23,7 @@ from processing.chain_step import carry, invert, join, to_laser, to_vehicle
 from processing.fusion import CHI_SQUARED_3_999, fuse
 from processing.match_search import agreement, search_match
 from processing.objection import objection
+from processing.odometry import SPEED_UP_M_S2, TURN_UP_RAD_S2
 from processing.scan_match import ScanMatch
 from processing.scan_matching import LEVER_M, Matcher
 from processing.scan_walls import Scan
@@ -41,7 +42,6 @@ OBJECTS = 0.02  # walls that fit worse by as much at the wheels' pose convict th
 NEUTRAL = 0.005  # smooth walls, which fit there as well, differ by less
 ASKEW_RAD = 0.05  # what moves along with the vehicle does not turn a match; one as far turned saw other walls
 HALF_TRACK_M = 0.8  # of a vehicle of this kind
-SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
 PAUSE_S = 1.0  # a single match after a longer one convicts nobody: where the vehicle went meanwhile, wheels know best
 SUSPECT_S = 3.0
 STUCK_M, STUCK_RAD = 1e-3, 1e-4

@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 # What a vehicle that stands still may still have moved: below the resolution of any wheel encoder.
 STANDING_M = 1e-4
 STANDING_RAD = 2e-5
+# What no vehicle does, wherever it is asked: to drive or turn faster, or to change its motion as fast.
+MAX_M_S, MAX_RAD_S = 20.0, 5.0
+SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0
 
 
 @dataclass(frozen=True, slots=True)

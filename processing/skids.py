@@ -12,29 +12,29 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from processing.odometry import Motions
+from processing.odometry import MAX_M_S, MAX_RAD_S, SPEED_UP_M_S2, TURN_UP_RAD_S2, Motions
 
 Array = NDArray[np.float64]
 
 LONGEST_S = 3.0
 MAX_PACE_S, UNEVEN = 0.3, 1.5  # samples further apart, or at no pace, do not show which change is sudden
-SPEED_UP_M_S2, TURN_UP_RAD_S2 = 6.0, 4.0  # no vehicle changes its motion faster
 OFF_M_S, OFF_RAD_S = 0.15, 1.0  # what an uneven floor and a quick hand at the wheel make of it, besides; so many times
 NOISE = 6.0  # what stamps that are off and coarse counts make of it everywhere
 SHARE = 0.15
 STEADY_M_S2, STEADY_RAD_S2 = 0.3, 0.3  # how much it may have changed meanwhile
 MOVES_M_S = 0.1
-MAX_M_S, MAX_RAD_S = 20.0, 5.0  # no vehicle drives or turns faster
 LEAST_JUMP_M, LEAST_JUMP_RAD = 2.0, 1.0
 ROLLS = (0.05, 0.02, 0.02)  # m, m, rad: doubt of a step that was filled in
 
 
 def without_skids(motions: Motions, seconds: Array) -> Motions:
     """The motions over so many `seconds` (n,), rolling on through every skid; `guessed` where they do."""
-    pace_s = float(np.median(seconds)) if len(seconds) else 0.0
-    seconds = np.maximum(seconds, pace_s / 2)  # times squeezed by a clock set back are no speed
+    if not len(seconds):
+        return motions
+    seconds = np.maximum(seconds, np.median(seconds) / 2)  # times squeezed by a clock set back are no speed
     velocities = motions.deltas / seconds[:, None]
-    guessed = _impossible(motions.deltas, velocities)
+    impossible = _impossible(motions.deltas, velocities)
+    guessed = impossible.copy()
     if has_pace(seconds):
         changes = np.abs(np.diff(velocities[:, [0, 2]], axis=0))
         changes = changes[np.abs(velocities[1:, 0]) > MOVES_M_S]
@@ -44,10 +44,11 @@ def without_skids(motions: Motions, seconds: Array) -> Motions:
     if not guessed.any():
         return motions
     kept, number = np.flatnonzero(~guessed), np.arange(len(seconds))
-    rolling = np.column_stack([np.interp(number, kept, velocities[kept, of]) for of in range(3)])
+    rolling = np.zeros_like(velocities)  # nothing is known where no step is one that a vehicle makes
+    if len(kept):
+        rolling = np.column_stack([np.interp(number, kept, velocities[kept, of]) for of in range(3)])
     deltas = np.where(guessed[:, None], rolling * seconds[:, None], motions.deltas)
     ample = motions.covariances + np.diag(np.square(ROLLS))
-    impossible = guessed & _impossible(motions.deltas, velocities)
     ample[impossible] = np.diag(np.square(ROLLS))  # their own doubt grew with a way that nobody drove
     return Motions(deltas, np.where(guessed[:, None, None], ample, motions.covariances), guessed)
 

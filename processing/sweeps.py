@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from processing.odometry import Motions
+from processing.odometry import MAX_M_S, MAX_RAD_S, Motions
 from processing.range_file import Ranges
 from processing.read_scans import Scans
 from processing.scan_walls import RANGE_NOISE_M, Scan, prepare_scan
@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Points = NDArray[np.float32]
 
-MAX_M_S, MAX_RAD_S = 20.0, 5.0
 AT_ONCE = 64  # scans straightened together
 
 

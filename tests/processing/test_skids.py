@@ -74,3 +74,14 @@ def test_a_pace_is_quick_and_even() -> None:
     assert not has_pace(np.full(50, 1.0))
     assert not has_pace(np.random.default_rng(1).uniform(0.01, 0.3, 50))
     assert not has_pace(np.zeros(0))
+
+
+def test_an_odometry_of_which_no_step_is_possible_tells_nothing() -> None:
+    """As one in millimetres: the walls must say all."""
+    mended = mend(1000 * rolling())
+    assert mended.guessed is not None
+    assert mended.guessed.all()
+    assert_allclose(mended.deltas, 0)
+    assert np.all(mended.covariances[:, 0, 0] > 1e-3)
+    none = mend(np.zeros((0, 3)), np.zeros(0))
+    assert len(none.deltas) == 0
