@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import Profile
-from processing.geometry import accumulate, compose, inverse, relative, wrap_angle
-from processing.open_loop import mount_pose, odometry_at_scans
+from processing.geometry import accumulate, compose, interpolate_poses, inverse, relative, wrap_angle
+from processing.open_loop import drive_blind, mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.scan_matching import match_scans
@@ -141,9 +141,8 @@ def join_pairs(parts: Sequence[LaserPairs]) -> LaserPairs:
 
 def pairs_of(run: Run, pairs: LaserPairs) -> Pairs:
     """The same as motions of the vehicle, beside what its wheels count."""
-    driven = accumulate(np.zeros(3), odometry_at_scans(run).deltas)
-    counted = relative(driven[pairs.ends[:, 0]], driven[pairs.ends[:, 1]])
-    return Pairs(counted, *through_mount(mount_pose(run), pairs.motions, pairs.covariances))
+    at = interpolate_poses(run.motion_times, drive_blind(run), run.scans.times[pairs.ends.ravel()]).reshape(-1, 2, 3)
+    return Pairs(relative(at[:, 0], at[:, 1]), *through_mount(mount_pose(run), pairs.motions, pairs.covariances))
 
 
 def scale_of(pairs: Pairs) -> WheelScale:

@@ -21,7 +21,7 @@ from hw_profiles.profile import OdometryNoise
 from processing.chain import Chain, Contradiction
 from processing.chain_step import add_up
 from processing.geometry import accumulate, compose, interpolate_poses, relative
-from processing.odometry import Motions, odom_motions, wheel_motions
+from processing.odometry import Motions, arc, odom_motions, wheel_motions, wheel_steps
 from processing.pose_graph import Links
 from processing.read_log import Run
 from processing.scan_matching import LEVER_M, Matcher
@@ -78,6 +78,15 @@ class OpenLoop:
 def mount_pose(run: Run) -> Array:
     mount = run.profile.lasers.primary.mount
     return np.array([mount.x_m, mount.y_m, np.radians(mount.yaw_deg)])
+
+
+def drive_blind(run: Run) -> Array:
+    """Dead reckoning at every sample of the odometry: poses (m, 3), the first at zero."""
+    if run.wheels is None:
+        assert run.odometry is not None
+        return relative(run.odometry[0], run.odometry)
+    distances, turns = wheel_steps(run.profile, run.wheels[:, 0], run.wheels[:, 1])
+    return accumulate(np.zeros(3), arc(np.column_stack([distances, turns, np.zeros(len(turns))])))
 
 
 def odometry_at_scans(run: Run) -> Motions:

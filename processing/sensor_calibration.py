@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from hw_profiles.profile import Profile
 from processing.even_clocks import with_even_clocks
 from processing.geometry import accumulate, compose, interpolate_poses, inverse, relative, wrap_angle
-from processing.odometry import arc, wheel_steps
-from processing.open_loop import mount_pose
+from processing.open_loop import drive_blind, mount_pose
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.turn_calibration import WheelTurn, put_right
@@ -91,7 +90,7 @@ def _without_lag(x_m: float, run: Run) -> float:
     """The mount's x, whether the odometry's steps were arcs or began with the heading of the sample before: then the
     vehicle looks as if its scanner sat half a step's way further back. In the middle of the two; 0 between them.
     """
-    ways = np.hypot(*np.diff(_dead_reckoned(run, 1.0, 1.0, 0.0, 0.0)[:, :2], axis=0).T)
+    ways = np.hypot(*np.diff(drive_blind(run)[:, :2], axis=0).T)
     ways = ways[ways > STANDS_M_S * np.diff(run.motion_times)]
     step_m = float(np.median(ways)) if len(ways) else 0.0
     least, most = x_m, x_m + step_m / 2
@@ -184,9 +183,9 @@ def _dead_reckoned(run: Run, scale: float, turn: float, bias: float, lag_s: floa
     """Poses (m, 3) at the odometry's samples, by wheels that count otherwise."""
     if run.wheels is not None:
         profile, wheels = put_right(run.profile, run.wheels, scale, WheelTurn(turn, bias, np.zeros((2, 2))))
-        second = wheels[:, 1] if lag_s == 0 else np.interp(run.motion_times - lag_s, run.motion_times, wheels[:, 1])
-        distances, turns = wheel_steps(profile, wheels[:, 0], second)
-        return accumulate(np.zeros(3), arc(np.column_stack([distances, turns, np.zeros(len(turns))])))
+        if lag_s != 0:
+            wheels[:, 1] = np.interp(run.motion_times - lag_s, run.motion_times, wheels[:, 1])
+        return drive_blind(replace(run, profile=profile, wheels=wheels))
     assert run.odometry is not None
     steps = relative(run.odometry[:-1], run.odometry[1:])
     bent = steps * np.array([scale, scale, turn])

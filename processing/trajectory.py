@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.edge_placement import Placed
-from processing.geometry import accumulate, compose, interpolate_poses, relative
-from processing.odometry import odom_motions, wheel_motions
-from processing.open_loop import FOREIGN_NOISE, OpenLoop
+from processing.geometry import compose, interpolate_poses, relative
+from processing.open_loop import OpenLoop, drive_blind
 from processing.read_log import Run
 
 Array = NDArray[np.float64]
@@ -70,12 +69,3 @@ def travelled(driven: Array, times: Array) -> Array:
     steps = relative(driven[:-1], driven[1:])
     way = np.hypot(steps[:, 0], steps[:, 1]) + LEVER_M * np.abs(steps[:, 2]) + 1e-3 * np.diff(times)
     return np.append(0.0, np.cumsum(way))
-
-
-def drive_blind(run: Run) -> Array:
-    """Dead reckoning at every sample of the odometry: poses (m, 3)."""
-    if run.wheels is not None:
-        motions = wheel_motions(run.profile, run.wheels[:, 0], run.wheels[:, 1])
-        return accumulate(np.zeros(3), motions.deltas)
-    assert run.odometry is not None
-    return accumulate(np.zeros(3), odom_motions(run.odometry, FOREIGN_NOISE).deltas)
