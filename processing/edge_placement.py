@@ -26,6 +26,7 @@ from processing.workers import Workers
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_Thin = tuple[Join, Ints]  # a join by one tag, and the part (pieces,) of every piece before it
 
 OVERLAP_ROUNDS = 2
 SURE_LINKS = 5  # between two parts: so many scan matches hold them together, whatever a tag says
@@ -103,21 +104,13 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, wor
     links = links + tag_links(passes, part, [piece.variables for piece in condensed])
     poses, _ = solve_frames(poses, condensed, links, _first_of_each(part))
     frames = [fit_frame(piece, poses) for piece in condensed]
-    joined = join_parts(place_drives(pieces, frames, [int(part[of.variables[0]]) for of in condensed]), passes)
-    thin: list[tuple[Join, Ints]] = []  # what hangs together by one tag, and the parts of the pieces before
-    for join in joined.joins:
-        links = links + join.links
-        if len(join.nodes) == 1:
-            thin.append((join, np.array([part[piece.variables[0]] for piece in condensed])))
-        frames = [
-            compose(join.move, frame) if part[piece.variables[0]] == join.parts[1] else frame
-            for frame, piece in zip(frames, condensed, strict=True)
-        ]
-        part = np.where(part == join.parts[1], join.parts[0], part)
-    part = np.unique(part, return_inverse=True)[1]
-    parts = [int(part[piece.variables[0]]) for piece in condensed]
-    poses, _ = solve_frames(spread_out(condensed, frames, boundary.count), condensed, links, _first_of_each(part))
-    frames = [fit_frame(piece, poses) for piece in condensed]
+    joins = join_parts(place_drives(pieces, frames, [int(part[of.variables[0]]) for of in condensed]), passes)
+    parts, frames, thin = _join(joins, [int(part[piece.variables[0]]) for piece in condensed], frames)
+    links = sum((join.links for join in joins), links)
+    if joins:
+        poses = spread_out(condensed, frames, boundary.count)
+        poses, _ = solve_frames(poses, condensed, links, _first_of_each(_parts_of(condensed, parts, boundary.count)))
+        frames = [fit_frame(piece, poses) for piece in condensed]
     for _ in range(OVERLAP_ROUNDS):
         grown = find_boundary(pieces)
         overlaps = find_overlaps(pieces, frames, parts, known)
@@ -137,6 +130,18 @@ def place_by_frames(solved: list[SolvedPiece], graph: Graph, match: Matcher, wor
     of_pieces = dict(reversed([(group.piece, part) for group, part in zip(groups, parts, strict=True)]))
     merged = merge_groups(solved, groups, bent)
     return _settle(merged, [of_pieces[p] for p in range(len(solved))], boundary, homes, poses, graph, notes)
+
+
+def _join(joins: list[Join], parts: list[int], frames: list[Array]) -> tuple[list[int], list[Array], list[_Thin]]:
+    """Part and frame of every piece after the joins, parts numbered from 0; and what hangs together by one tag."""
+    of, thin = np.array(parts), list[_Thin]()
+    for join in joins:
+        if len(join.nodes) == 1:
+            thin.append((join, of))
+        moved = of == join.parts[1]
+        frames = [compose(join.move, frame) if moves else frame for frame, moves in zip(frames, moved, strict=True)]
+        of = np.where(moved, join.parts[0], of)
+    return np.unique(of, return_inverse=True)[1].tolist(), frames, thin
 
 
 def _links_between(join: Join, parts: Ints) -> int:

@@ -12,6 +12,7 @@ way only if the walls around it fit one way and not the other.
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -31,6 +32,7 @@ Ints = NDArray[np.int64]
 
 FAR_ENOUGH_M = 15.0  # tags nearer to each other than that do not say which way a part faces
 WITNESSES = 4  # shared tags at which the scans are asked, too
+MOST_TRIES = 6  # pairs of passes of one tag: what half a dozen do not tell, the others do not either
 ALONG_M, ALONG_STEP_M = 8.0, 0.25  # how far along a drift a tag may be read from elsewhere
 CLEARLY_FEWER, MOST = 0.8, 3.0  # scans that contradict: by how many less for the right of two ways, and at most
 BLUNT_M = 2.0  # two places along a drift this far apart
@@ -94,21 +96,14 @@ def tag_links(passes: Sequence[TagPass], part: Ints, pieces: Sequence[Ints]) -> 
     return Links.of(np.array(ends), np.zeros((len(ends), 3)), informations, robust=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Joined:
-    joins: list[Join]  # in order
-    apart: list[int]  # tags at which parts stay apart
-
-
-def join_parts(drives: Sequence[PlacedDrive], passes: Sequence[TagPass]) -> Joined:
-    """Join parts as long as there are two that share a tag and lie to each other in one way only."""
+def join_parts(drives: Sequence[PlacedDrive], passes: Sequence[TagPass]) -> list[Join]:
+    """Join parts as long as there are two that share a tag and lie to each other in one way only; in that order."""
     drives, joins, refused = list(drives), list[Join](), set[tuple[int, int]]()
     while True:
         shared = _shared_nodes(drives, passes)
         ranked = sorted((pair for pair in shared if pair not in refused), key=lambda pair: (-len(shared[pair]), pair))
         if not ranked:
-            apart = sorted({node for nodes in shared.values() for node in nodes})
-            return Joined(joins, apart)
+            return joins
         a, b = ranked[0]
         found = _join(drives, [of for of in passes if of.node in shared[a, b]], (a, b))
         if found is None:
@@ -136,8 +131,9 @@ def _join(drives: list[PlacedDrive], passes: Sequence[TagPass], parts: tuple[int
     if spread_m < FAR_ENOUGH_M / 2:
         return _join_by_one(drives, ours, theirs, parts)
     move = align(places[1], places[0])
+    first = {one.node: one for one in reversed(ours)}
+    links, seen = _links_of_tags([(first[other.node], other) for other in theirs]), []  # a part's own hang together
     pairs = [(one, other) for one in ours for other in theirs if one.node == other.node]
-    links, seen = _links_of_tags(pairs), []
     for one, other in pairs[:: max(1, len(pairs) // WITNESSES)]:
         at, there = drives[one.drive].passing(one), drives[other.drive].passing(other)
         heading = float(relative(at.pose, compose(move, there.pose))[2])
@@ -167,13 +163,15 @@ def _join_by_one(
     drives: list[PlacedDrive], ours: Sequence[TagPass], theirs: Sequence[TagPass], parts: tuple[int, int]
 ) -> Join | None:
     """By one tag, or by tags too near to each other to say which way a part faces."""
-    for one, other in [(one, other) for one in ours for other in theirs if one.node == other.node]:
+    stretch = cache(lambda of: drives[of.drive].stretch(of))
+    pairs = [(one, other) for one in ours for other in theirs if one.node == other.node]
+    for one, other in pairs[:: max(1, len(pairs) // MOST_TRIES)]:
         at, there = drives[one.drive].passing(one), drives[other.drive].passing(other)
         clear = register_passes(at, there)
         if clear is not None:
             links = _links_of_scans([(one, other, clear)]) + _links_of_tags([(one, other)])
             return Join(parts, compose(compose(at.pose, clear.motion), inverse(there.pose)), links, [one.node])
-        found = _by_stretches(drives[one.drive].stretch(one), drives[other.drive].stretch(other), at, there)
+        found = _by_stretches(stretch(one), stretch(other), at, there)
         if found is not None:
             motion, covariance = found
             ends = np.array([(one.variable, other.variable)])
