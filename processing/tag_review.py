@@ -19,7 +19,7 @@ from processing.scan_matching import Matcher
 from processing.trajectory import keyframe_poses
 
 REACH_M = 20.0  # from the middle of a cloud to its ends; no reader of passive tags reaches as far
-ELSEWHERE = "it was read over much less way than on its other passes: from elsewhere, down the drift or through rock"
+ELSEWHERE = "it was read over much less way than is usual: from elsewhere, down the drift or through rock"
 RIDES = "it was read on and on over more way than a reader reaches: it rides along"
 MOVED = "by its distance to other tags it was read at more than one place: moved, or two tags of one EPC"
 
