@@ -26,13 +26,13 @@ from processing.turn_calibration import WheelTurn, put_right
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NAMES = ("mount x", "mount y", "mount yaw", "delay", "scale", "turn", "bias", "steering lag")
-PRIORS = np.array([0.2, 0.2, 0.1, 0.1, 0.02, 0.03, 0.02, 0.05])  # m, m, rad, s, -, -, rad/m, s
+# mount x [m], y [m] and yaw [rad], delay [s]; of the wheels: scale, turn, bias [rad/m], lag of the steering [s]
+PRIORS = np.array([0.2, 0.2, 0.1, 0.1, 0.02, 0.03, 0.02, 0.05])
 STEPS = np.array([1e-3, 1e-3, 1e-4, 1e-3, 1e-4, 1e-4, 1e-5, 1e-3])  # of the numeric derivatives
 SENSOR = 4  # the first of them are of the sensor, the others of the wheels
-FLOORS = np.array([0.05, 0.03, np.radians(0.2), 0.008])  # what is wrong by less is left alone
+FLOORS = np.array([0.05, 0.03, np.radians(0.2), 0.008, *[-np.inf] * 4])  # what is wrong by less is left alone
 STANDS_M_S = 0.1
-SURE = np.array([0.03, 0.03, np.radians(0.3), 0.01])  # standard deviations above these say too little
+SURE = np.array([0.03, 0.03, np.radians(0.3), 0.01, *[np.inf] * 4])  # standard deviations above these say too little
 SIGNIFICANT = 5.0  # standard deviations
 PAIR_NOISE = np.array([0.01, 0.01, 0.003])  # m, m, rad: what slip and roughness leave of one pair
 AT_ONCE = 4.0  # pairs overlap and share their scans: so many of them count as one
@@ -69,20 +69,20 @@ def fit_sensor(run: Run, pairs: LaserPairs) -> SensorFit:
     """What is surely wrong; all else is taken as the profile says."""
     if len(pairs.ends) < LEAST_PAIRS:
         return NOTHING
-    free = np.ones(len(NAMES), bool)
+    free = np.ones(len(PRIORS), bool)
     free[-1] = (
         run.profile.vehicle is not None and run.profile.vehicle.kinematics == "tricycle" and run.wheels is not None
     )
     while True:
         value, sigma, cost = _fit(run, pairs, free)
         value[0] = _without_lag(value[0], run)
-        proven = (np.abs(value) > np.maximum(SIGNIFICANT * sigma, _floors())) & (sigma < _sure())
+        proven = (np.abs(value) > np.maximum(SIGNIFICANT * sigma, FLOORS)) & (sigma < SURE)
         proven[SENSOR:] = True  # the wheels' are never left out
         if np.all(proven[free]) or not proven[:SENSOR].any():
             used = free[:SENSOR] & proven[:SENSOR]
             return SensorFit(np.where(used, value[:SENSOR], 0.0), sigma[:SENSOR], used, cost)
         # the least proven goes first: what it took from the others comes back to them
-        doubt = np.where(free & ~proven, np.abs(value) / np.maximum(sigma, _floors()), np.inf)
+        doubt = np.where(free & ~proven, np.abs(value) / np.maximum(sigma, FLOORS), np.inf)
         free[int(np.argmin(doubt))] = False
 
 
@@ -97,14 +97,6 @@ def _without_lag(x_m: float, run: Run) -> float:
     return 0.0 if least < FLOORS[0] and most > -FLOORS[0] else (least + most) / 2
 
 
-def _floors() -> Array:
-    return np.append(FLOORS, np.zeros(len(NAMES) - SENSOR) - np.inf)
-
-
-def _sure() -> Array:
-    return np.append(SURE, np.full(len(NAMES) - SENSOR, np.inf))
-
-
 def calibrate_sensor(run: Run, pairs: LaserPairs) -> tuple[Run, list[str]]:
     """The run with its mount and its times put right, and what was wrong, a line each."""
     found, lines = fit_sensor(run, pairs), []
@@ -117,21 +109,24 @@ def calibrate_sensor(run: Run, pairs: LaserPairs) -> tuple[Run, list[str]]:
             lines.append(f"the stamps jitter by {1e3 * scatter:.0f} ms; even times were used")
     if not found.used.any():
         return run, lines
-    return apply_fit(run, found), lines + tell(found)
+    return apply_fit(run, found), lines + tell(found, scans_late=_scans_are_late(run, found))
+
+
+def _scans_are_late(run: Run, fit: SensorFit) -> bool:
+    """Latency makes stamps late, never early, so the sign of a delay says whose they are. Another system's odometry is
+    moved in any case: a scan's pose goes by the scan's stamp there.
+    """
+    return bool(fit.off[3] > 0) and run.wheels is not None
 
 
 def apply_fit(run: Run, fit: SensorFit) -> Run:
-    """The run with its mount put right, and the times of what is late.
-
-    Latency makes stamps late, never early, so the sign of a delay says whose they are. Another system's odometry is
-    moved in any case: a scan's pose goes by the scan's stamp there.
-    """
+    """The run with its mount put right, and the times of what is late."""
     x_m, y_m, yaw_rad, delay_s = fit.off.tolist()
     run = replace(run, profile=_with_mount(run.profile, x_m, y_m, yaw_rad))
     if delay_s == 0:
         return run
     stamped = run.stamped or (run.scans.times, run.motion_times)
-    if delay_s > 0 and run.wheels is not None:
+    if _scans_are_late(run, fit):
         return replace(run, scans=replace(run.scans, times=run.scans.times - delay_s), stamped=stamped)
     moved = replace(run, motion_times=run.motion_times + delay_s)
     return replace(moved, stamped=stamped) if run.wheels is not None else moved
@@ -139,12 +134,13 @@ def apply_fit(run: Run, fit: SensorFit) -> Run:
 
 def _fit(run: Run, pairs: LaserPairs, free: NDArray[np.bool_]) -> tuple[Array, Array, float]:
     """Robust Gauss–Newton: values (8,), standard deviations (8,), and the mean cost of a pair."""
-    value, chosen = np.zeros(len(NAMES)), np.flatnonzero(free)
+    value, chosen = np.zeros(len(PRIORS)), np.flatnonzero(free)
     informations = _informations(run, pairs)
     for _ in range(ROUNDS):
         residuals = _residuals(run, pairs, value)
         jacobian = np.stack(
-            [(_residuals(run, pairs, value + STEPS * np.eye(len(NAMES))[n]) - residuals) / STEPS[n] for n in chosen], -1
+            [(_residuals(run, pairs, value + STEPS * np.eye(len(PRIORS))[n]) - residuals) / STEPS[n] for n in chosen],
+            -1,
         )
         squares = np.einsum("ki,kij,kj->k", residuals, informations, residuals)
         spread = max(1.0, float(np.median(squares)) / MEDIAN)
@@ -201,13 +197,14 @@ def _with_mount(profile: Profile, x_m: float, y_m: float, yaw_rad: float) -> Pro
     return msgspec.structs.replace(profile, lasers=msgspec.structs.replace(lasers, primary=primary))
 
 
-def tell(fit: SensorFit) -> list[str]:
+def tell(fit: SensorFit, *, scans_late: bool) -> list[str]:
     """A line for each figure that was found wrong."""
+    stamps = ("the scans' stamps", 1e3) if scans_late else ("the odometry's stamps", -1e3)
     units: list[tuple[str, float, str]] = [
         ("the scanner's x_m", 1.0, "m"),
         ("the scanner's y_m", 1.0, "m"),
         ("the scanner's yaw_deg", float(np.degrees(1)), "°"),
-        ("the scans' stamps", 1e3, "ms"),
+        (*stamps, "ms"),
     ]
     return [
         f"{what} off by {off * unit:.2f} ± {sigma * unit:.2f} {symbol}"
