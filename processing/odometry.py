@@ -13,6 +13,7 @@ eq. (1) of Lavigne & Marshall (2012) takes Euler's step: the two agree as the tu
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +61,17 @@ def wheel_steps(profile: Profile, first: Array, second: Array) -> tuple[Array, A
         right = np.diff(second) * _radius(profile, "right_wheel")
         return (left + right) / 2, (right - left) / _size(vehicle.track_width_m)
     rolled = np.diff(first) * _radius(profile, "drive_wheel")
-    steering = (second[1:] + second[:-1]) / 2  # the mid-point of the step
-    if vehicle.drive_axle == "front":  # the wheel rolls along its own heading, not the vehicle's
-        return rolled * np.cos(steering), rolled * np.sin(steering) / _size(vehicle.wheelbase_m)
-    return rolled, rolled * np.tan(steering) / _size(vehicle.wheelbase_m)
+    return steered_steps(rolled, second, _size(vehicle.wheelbase_m), vehicle.drive_axle)
+
+
+def steered_steps(
+    rolled_m: Array, steering: Array, wheelbase_m: float, axle: Literal["rear", "front"]
+) -> tuple[Array, Array]:
+    """The same of a tricycle whose wheel on this axle rolled so far (n - 1,), with steering angles (n,) [rad]."""
+    middle = (steering[1:] + steering[:-1]) / 2  # of the step
+    if axle == "front":  # the wheel rolls along its own heading, not the vehicle's
+        return rolled_m * np.cos(middle), rolled_m * np.sin(middle) / wheelbase_m
+    return rolled_m, rolled_m * np.tan(middle) / wheelbase_m
 
 
 def odom_motions(poses: Array, noise: OdometryNoise) -> Motions:
