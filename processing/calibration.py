@@ -5,7 +5,7 @@ percent or two, always the same way: a worn tyre, a wrong radius in the profile.
 crossing comes by, scan matches see how far the vehicle really went; what is learnt there is carried into the drifts
 where the laser sees nothing along the way.
 
-What they say wrongly about turns is `turn_calibration`'s.
+What they say wrongly about turns is put right before: `wheel_turns`.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw_profiles.profile import Profile
-from processing.geometry import accumulate, compose, interpolate_poses, inverse, relative, wrap_angle
+from processing.geometry import accumulate, compose, interpolate_poses, inverse, relative
 from processing.open_loop import drive_blind, mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.scan_match import through_mount
 from processing.scan_matching import match_scans
 from processing.sensor_calibration import LaserPairs
 from processing.sweeps import Sweeps, sweeps_of
-from processing.turn_calibration import WheelTurn, fit_turn, put_right
+from processing.turn_calibration import AS_COUNTED, put_right
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,7 +33,6 @@ MAX_PAIRS = 400  # of each stride
 COMPARED_AT_ONCE = 50
 MAX_TURN_RAD = 0.3  # in a curve, arc and chord differ
 MOST_TURN_RAD = 1.0  # beyond, a scanner sees too little twice
-WHEELS_M = 0.05  # how well the wheels know a few metres, where the walls do not show them
 MIN_INLIERS = 0.8
 MAX_SIGMA_M = 0.02  # a match that knows the way less well says nothing of a percent
 PAIR_NOISE_M = 0.01  # what slip and roughness leave of one pair
@@ -65,14 +64,14 @@ class Pairs:
 
 
 def calibrate(run: Run, pairs: Pairs) -> tuple[Run, WheelScale]:
-    """The run with its wheels as the laser sees them; its distances as they were where the laser sees too little."""
+    """The run with its distances as the laser sees them, or as they were where it sees too little; turns stay."""
     found = scale_of(pairs)
     if found.sigma > MAX_SIGMA:
         found = replace(found, scale=1.0)
     if run.odometry is not None:
         return replace(run, odometry=run.odometry * np.array([found.scale, found.scale, 1.0])), found
     assert run.wheels is not None
-    profile, wheels = put_right(run.profile, run.wheels, found.scale, turn_of(pairs))
+    profile, wheels = put_right(run.profile, run.wheels, found.scale, AS_COUNTED)
     if found.sigma <= MAX_SIGMA:
         profile = _with_noise(profile, found.noise_m_per_sqrt_m)
     return replace(run, wheels=wheels, profile=profile), found
@@ -151,15 +150,6 @@ def scale_of(pairs: Pairs) -> WheelScale:
     used = straight & (pairs.covariances[:, 0, 0] < MAX_SIGMA_M**2)
     variances = pairs.covariances[used, 0, 0] + PAIR_NOISE_M**2
     return fit_scale(pairs.counted[used, 0], pairs.seen[used, 0], variances)
-
-
-def turn_of(pairs: Pairs) -> WheelTurn:
-    """From all pairs: smooth walls show headings too, once the wheels say how far it was."""
-    known = np.linalg.inv(np.linalg.inv(pairs.covariances) + np.diag([WHEELS_M**-2, 0.0, 0.0]))
-    change = wrap_angle(pairs.seen[:, 2] - pairs.counted[:, 2])
-    half = pairs.counted[:, 2] / 2
-    ahead_m = pairs.counted[:, 0] / np.cos(half) / np.sinc(half / np.pi)  # the arc over its chord
-    return fit_turn(pairs.counted[:, 2], ahead_m, pairs.counted[:, 2] + change, known[:, 2, 2])
 
 
 def stride_pairs(way: Array) -> Ints:

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from processing.beacons import Pass, find_passes
-from processing.calibration import WheelScale, calibrate, compare_strides, cut_strides, join_pairs, pairs_of
+from processing.calibration import WheelScale, calibrate, compare_strides, cut_strides, join_pairs
 from processing.odometry import Motions, dead_reckon
 from processing.open_loop import mount_pose, odometry_at_scans
 from processing.read_log import Run
 from processing.sensor_calibration import LaserPairs, calibrate_sensor
 from processing.sweeps import Sweeps, sweeps_of
+from processing.wheel_turns import calibrate_turns, tell_turns
 from processing.workers import Workers
 
 
@@ -36,7 +37,10 @@ def make_ready(runs: list[Run], with_tags: bool, work: Workers) -> list[ReadyRun
 
 def _ready(run: Run, pairs: LaserPairs, with_tags: bool) -> ReadyRun:
     run, put_right = calibrate_sensor(run, pairs)
-    run, wheels = calibrate(run, pairs_of(run, pairs))
+    before = run.profile
+    run, motions, found = calibrate_turns(run, pairs)
+    run, wheels = calibrate(run, motions)
+    put_right += tell_turns(before, run.profile, found, wheels.sigma)
     odometry = odometry_at_scans(run)
     passes: list[Pass] = []
     if with_tags and len(run.tags.epcs):

@@ -33,6 +33,9 @@ class WheelTurn:
     covariance: Array  # (2, 2)
 
 
+AS_COUNTED = WheelTurn(1.0, 0.0, np.zeros((2, 2)))
+
+
 def fit_turn(counted: Array, ahead_m: Array, seen: Array, variances: Array) -> WheelTurn:
     """Robust least squares over k pairs, drawn to a scale of 1 and no bias by what is known of wheels beforehand.
 

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from hw_profiles.profile import load_profile
-from processing.calibration import compare_strides, cut_strides, join_pairs, pairs_of, turn_of
+from processing.calibration import compare_strides, cut_strides, join_pairs, pairs_of
 from processing.odometry import wheel_steps
 from processing.pipeline import DrivenRun
 from processing.turn_calibration import PRIOR_BIAS_PER_M, PRIOR_SCALE, WheelTurn, fit_turn, put_right
+from processing.wheel_turns import turn_of
 
 
 def test_scale_and_bias_are_found_among_slip_and_matches_that_jumped() -> None:
