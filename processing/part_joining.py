@@ -134,11 +134,16 @@ def _join(drives: list[PlacedDrive], passes: Sequence[TagPass], parts: tuple[int
     first = {one.node: one for one in reversed(ours)}
     links, seen = _links_of_tags([(first[other.node], other) for other in theirs]), []  # a part's own hang together
     pairs = [(one, other) for one in ours for other in theirs if one.node == other.node]
-    for one, other in pairs[:: max(1, len(pairs) // WITNESSES)]:
+    for one, other in _some(pairs, WITNESSES):
         at, there = drives[one.drive].passing(one), drives[other.drive].passing(other)
         heading = float(relative(at.pose, compose(move, there.pose))[2])
         seen += [(one, other, match) for _, match in pass_hypotheses(at, there, (heading,))[:1]]
     return Join(parts, move, links + _links_of_scans(seen), nodes)
+
+
+def _some(pairs: list[tuple[TagPass, TagPass]], most: int) -> list[tuple[TagPass, TagPass]]:
+    """From first to last; no even stride, for that may meet the same pass of theirs each time."""
+    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int)]
 
 
 def _middle(drives: list[PlacedDrive], passes: Sequence[TagPass], node: int) -> Array:
@@ -165,7 +170,7 @@ def _join_by_one(
     """By one tag, or by tags too near to each other to say which way a part faces."""
     stretch = cache(lambda of: drives[of.drive].stretch(of))
     pairs = [(one, other) for one in ours for other in theirs if one.node == other.node]
-    for one, other in pairs[:: max(1, len(pairs) // MOST_TRIES)]:
+    for one, other in _some(pairs, MOST_TRIES):
         at, there = drives[one.drive].passing(one), drives[other.drive].passing(other)
         clear = register_passes(at, there)
         if clear is not None:

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from processing.build import Config, build
 from processing.comparison import compare_truth
 from processing.geometry import compose, relative
-from processing.part_joining import PlacedDrive, TagPass, join_parts, tag_links
+from processing.part_joining import PlacedDrive, TagPass, _some, join_parts, tag_links
 from processing.scan_walls import Scan, prepare_scan
 from processing.simulation.simulate import simulate
 
@@ -99,3 +99,14 @@ def test_one_tag_and_blind_scans_join_nothing() -> None:
 
 def blind_scan() -> Scan:
     return prepare_scan(np.full((50, 2), np.nan), -1.0, 0.04)
+
+
+def test_no_more_pairs_are_asked_than_are_of_use_and_all_passes_come_by() -> None:
+    ours = [TagPass(v, 7, 0, v, 2.0) for v in range(6)]
+    theirs = [TagPass(v, 7, 1, v, 2.0) for v in (10, 11)]
+    pairs = [(one, other) for one in ours for other in theirs]
+    asked = _some(pairs, 6)
+    assert len(asked) == 6
+    assert {other.variable for _, other in asked} == {10, 11}
+    assert len({one.variable for one, _ in asked}) == 6
+    assert _some(pairs[:3], 6) == pairs[:3]
