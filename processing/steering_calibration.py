@@ -25,6 +25,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from processing.geometry import accumulate, compose, interpolate_poses, inverse, relative, wrap_angle
 from processing.odometry import arc, steered_steps
 from processing.scan_match import through_mount
+from processing.sensor_calibration import AT_ONCE, MEDIAN, PAIR_NOISE
 
 Array = NDArray[np.float64]
 
@@ -33,10 +34,7 @@ GEAR, ZERO, RADIUS, WHEELBASE = range(4)
 MOUNT = slice(4, 7)
 SCALES = np.array([0.1, 0.1, 0.01, 0.1, 0.1, 0.1, 0.1])  # of a step, so that one figure counts as much as another
 OTHER_GEARS = (1.0, 0.2, 0.5, 2.0, 5.0)  # starts, where nothing is known of it: its cost has more than one valley
-PAIR_NOISE = np.array([0.01, 0.01, 0.003])  # m, m, rad: what slip and roughness leave of one pair
-AT_ONCE = 4.0  # pairs overlap and share their scans: so many of them count as one
 CORNER = 1.0  # beyond so much, a residual is doubted
-MEDIAN = 2.37  # of chi squared with three degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
