@@ -77,7 +77,10 @@ def test_what_is_late_is_moved_and_the_stamps_are_kept(bends: tuple[Run, LaserPa
     scans, motions = (true[0] + late_s, true[1]) if late_s > 0 else (true[0], true[1] - late_s)
     late = replace(run, scans=replace(run.scans, times=scans), motion_times=motions)
     found, told = calibrate_sensor(late, bends[1])
-    assert len(told) == 1
+    (line,) = told
+    whose, off = line.split(" stamps off by ")
+    assert whose == ("the scans'" if late_s > 0 else "the odometry's")
+    assert float(off.split(" ±")[0]) == pytest.approx(60, abs=15)  # ms late, whoever it is
     assert_allclose(found.scans.times, true[0], atol=0.015)
     assert_allclose(found.motion_times, true[1], atol=0.015)
     assert found.stamped is not None
